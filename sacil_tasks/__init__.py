@@ -1,0 +1,1 @@
+"""Size-sensitive manipulation tasks for ManiSkill 3."""

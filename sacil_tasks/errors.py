@@ -1,0 +1,38 @@
+"""What a user did that cannot work, said in one sentence, and look-ups that name the nearest match."""
+
+import difflib
+import sys
+from collections.abc import Callable, Iterable
+
+
+class UsageError(Exception):
+    """Expected, came, what to do: the message is all a user sees (no traceback)."""
+
+
+def find_name(name: str, known: Iterable[str], kind: str) -> str:
+    """Return `name` if it is known.
+
+    Raises:
+        UsageError: names the nearest known names and all of them.
+    """
+    names = sorted(known)
+    if name in names:
+        return name
+    near = difflib.get_close_matches(name, names, n=2)
+    hint = f" Did you mean {' or '.join(near)}?" if near else ""
+    raise UsageError(f"no {kind} called '{name}'.{hint} Known: {', '.join(names) or 'none'}.")
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Run a command line: a `UsageError` is one sentence and exit code 2, Ctrl-C is 130."""
+    try:
+        main()
+    except UsageError as error:
+        sys.exit(_say(error, code=2))
+    except KeyboardInterrupt:
+        sys.exit(_say("stopped by Ctrl-C; the same command again resumes.", code=130))
+
+
+def _say(message: object, *, code: int) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return code
