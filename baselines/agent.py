@@ -1,0 +1,154 @@
+"""What an agent is, and how it is found by name.
+
+An agent is one file in `baselines/agents` or `sacil_agent/agents` with a module attribute
+`AGENT = AgentSpec(...)`. Names come from the file names, so a listing imports nothing.
+"""
+
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal, Protocol
+
+from torch import Tensor, nn
+
+from baselines.batch import Batch, Inputs, Prediction
+from baselines.text import TextSpec
+from sacil_tasks.errors import UsageError, find_name
+
+AGENT_PACKAGES = ("baselines.agents", "sacil_agent.agents")
+"""Where agents live; named, not imported, because `sacil_agent` builds on this package."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """How a network is trained; shared by all agents so that tables compare methods."""
+
+    samples: int = 120_000
+    """Behaviour-cloning samples in all: the budget, whatever the machine's speed."""
+
+    batch: int = 16
+    """Samples of one step."""
+
+    lr: float = 1.6e-3
+    """Peak learning rate of LAMB; RVT's rule is 1e-4 per sample of a batch."""
+
+    warmup_steps: int = 200
+    """Steps of linear warm-up before the cosine."""
+
+    weight_decay: float = 1e-6
+    """Decoupled weight decay on every tensor."""
+
+    ema_decay: float = 0.998
+    """Decay of the weight average that is saved and evaluated; 0 takes the raw weights."""
+
+    rotation_weight: float = 3.0
+    """Weight of the rotation loss against the other terms."""
+
+    rotation_sigma_bins: float = 1.5
+    """Width of the circular Gaussian over the 72 rotation bins; 0 gives one-hot labels."""
+
+    heatmap_sigma_px: float = 1.5
+    """Width of the Gaussian over a view's pixels."""
+
+    max_yaw_deg: float = 45.0
+    """Yaw augmentation of cloud and action together, uniform in +- this angle."""
+
+    max_shift_m: float = 0.125
+    """Translation augmentation, uniform in +- this distance on each axis."""
+
+    image_noise: float = 0.0
+    """Largest amplitude of the uniform noise added to the views (RVT: 0.1)."""
+
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Arithmetic of forward and backward; weights and optimiser are always fp32."""
+
+    text: str = "minilm"
+    """Frozen text encoder: `minilm`, or `clip:<hub id or local folder>`."""
+
+
+class AgentConfig(Protocol):
+    """What the trainer reads of an agent's config: a frozen dataclass of the agent's own."""
+
+    @property
+    def pixels(self) -> int:
+        """Pixels per side of a virtual view."""
+
+    @property
+    def recipe(self) -> Recipe:
+        """How to train it."""
+
+
+class Network(nn.Module):
+    """A keyframe predictor. Dropout draws from torch's global generator, which the trainer seeds."""
+
+    needs_goals: bool = False
+    """Whether `loss` reads `Batch.goal_views`."""
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The training loss, and its terms and diagnostics as detached scalars.
+
+        A term that does not exist for this batch (an accuracy over no pairs) is NaN and is left
+        out of the logged mean.
+        """
+        raise NotImplementedError
+
+    def act(self, inputs: Inputs) -> Prediction:
+        """The keyframe chosen for each observation; call in `eval` mode without gradients."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSpec:
+    """Everything the trainer and the policies need to know about one agent."""
+
+    name: str
+    presets: Mapping[str, Any]
+    """Named configs; the first is the default."""
+
+    create: Callable[[Any, TextSpec], Network]
+    """Config and text encoder's spec to a freshly initialised network."""
+
+    variants: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    """Named ablations, each a change of the config."""
+
+    def config(self, preset: str, variant: str | None = None) -> Any:
+        """The config of `preset`, changed by `variant`.
+
+        Raises:
+            UsageError: no such preset or variant.
+        """
+        config = self.presets[find_name(preset, self.presets, f"preset of {self.name}")]
+        if variant is None:
+            return config
+        return self.variants[find_name(variant, self.variants, f"variant of {self.name}")](config)
+
+
+@cache
+def agent_modules() -> dict[str, str]:
+    """Agent names and their modules, from the file names; nothing is imported."""
+    found = {}
+    for package in AGENT_PACKAGES:
+        spec = importlib.util.find_spec(package)
+        folders = spec.submodule_search_locations if spec else None
+        for module in pkgutil.iter_modules(folders or []):
+            found[module.name] = f"{package}.{module.name}"
+    return found
+
+
+def find_agent(name: str) -> tuple[AgentSpec, str | None]:
+    """The spec of `name`, and the variant of `name:variant`.
+
+    Raises:
+        UsageError: no such agent or variant.
+    """
+    base, _, variant = name.partition(":")
+    module = agent_modules()[find_name(base, agent_modules(), "agent")]
+    spec: AgentSpec = importlib.import_module(module).AGENT
+    if variant:
+        find_name(variant, spec.variants, f"variant of {base}")
+    elif name.endswith(":"):
+        raise UsageError(f"'{name}' names no variant. Known: {', '.join(sorted(spec.variants))}.")
+    return spec, variant or None

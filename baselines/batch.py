@@ -1,0 +1,70 @@
+"""What a network reads and what it is taught, as tensors of one batch.
+
+Positions are in cube coordinates ([-1, 1] on each axis spans `interface.SCENE_BOUNDS`).
+"""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What an agent may see before it chooses a keyframe."""
+
+    views: Float[Tensor, "b v 7 h w"]
+    """Virtual views: xyz (cube), rgb ([0, 1]), depth; see `baselines.views`."""
+
+    proprio: Float[Tensor, "b 2"]
+    """Gripper open (0 or 1) and time, from 1 at the first keyframe down to -1."""
+
+    text: Float[Tensor, "b t e"]
+    """Token vectors of the frozen text encoder; zeros where `text_mask` is False."""
+
+    text_mask: Bool[Tensor, "b t"]
+    """True at real tokens; the last of them is the end-of-text token."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The expert's keyframe, in the frame of the augmented cube."""
+
+    position_in_cube: Float[Tensor, "b 3"]
+    rotation_bins: Int64[Tensor, "b 3"]
+    gripper_open: Int64[Tensor, "b"]
+    ignore_collisions: Int64[Tensor, "b"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One training step."""
+
+    inputs: Inputs
+    labels: Labels
+
+    goal_views: Float[Tensor, "b v 7 h w"] | None
+    """Views of the observation at the keyframe to be reached, with their own augmentation;
+    None unless the network asks for goals."""
+
+    task: Int64[Tensor, "b"]
+    """Index of the task in the training set."""
+
+    meaning: Int64[Tensor, "b"]
+    """Equal for equal task and slots, whatever the sentence."""
+
+    trajectory: Int64[Tensor, "b"]
+    """Equal for samples of one demonstration."""
+
+    first: Bool[Tensor, "b"]
+    """True at the first keyframe of a demonstration (the arm is still at home)."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What an agent chose for each observation."""
+
+    position_in_cube: Float[Tensor, "b 3"]
+    quaternion_wxyz: Float[Tensor, "b 4"]
+    gripper_open: Bool[Tensor, "b"]
+    ignore_collisions: Bool[Tensor, "b"]
