@@ -1,0 +1,82 @@
+"""From four RGB-D images to one coloured point cloud in the robot base frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
+
+from baselines.compiled import compiled
+
+METRES_PER_MILLIMETRE = 1e-3
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured points, camera after camera, row after row."""
+
+    xyz_in_base: Float32[np.ndarray, "n 3"]
+    """Positions in metres."""
+
+    rgb: UInt8[np.ndarray, "n 3"]
+    """Colours as the cameras gave them."""
+
+
+def unproject(
+    rgb: UInt8[np.ndarray, "k h w 3"],
+    depth_mm: UInt16[np.ndarray, "k h w"],
+    intrinsics: Float32[np.ndarray, "k 3 3"],
+    camera_in_base: Float32[np.ndarray, "k 4 4"],
+) -> Cloud:
+    """Lift every pixel with depth to a point; the arguments are fields of `Observation`.
+
+    Pixels whose depth is 0 saw nothing and are dropped, so the cloud may be empty.
+    """
+    rays = METRES_PER_MILLIMETRE * camera_in_base[:, :3, :3] @ np.linalg.inv(intrinsics)
+    xyz_in_base = np.empty((depth_mm.size, 3), np.float32)
+    colours = np.empty((depth_mm.size, 3), np.uint8)
+    count = _lift(
+        rgb,
+        depth_mm,
+        rays.astype(np.float32),
+        camera_in_base[:, :3, 3].astype(np.float32),
+        xyz_in_base,
+        colours,
+    )
+    return Cloud(xyz_in_base=xyz_in_base[:count], rgb=colours[:count])
+
+
+@compiled
+def _lift(
+    rgb: np.ndarray,
+    depth_mm: np.ndarray,
+    rays: np.ndarray,
+    origins: np.ndarray,
+    xyz_in_base: np.ndarray,
+    colours: np.ndarray,
+) -> int:
+    """Write the points into the last two arrays and return how many there are.
+
+    `rays[k] @ (column, row, 1)` is the displacement in metres per millimetre of depth.
+    """
+    half = np.float32(0.5)
+    count = 0
+    for k in range(depth_mm.shape[0]):
+        ray, origin = rays[k], origins[k]
+        for i in range(depth_mm.shape[1]):
+            v = np.float32(i) + half
+            start_x = ray[0, 1] * v + ray[0, 2]
+            start_y = ray[1, 1] * v + ray[1, 2]
+            start_z = ray[2, 1] * v + ray[2, 2]
+            for j in range(depth_mm.shape[2]):
+                depth = np.float32(depth_mm[k, i, j])
+                if depth == 0:
+                    continue
+                u = np.float32(j) + half
+                xyz_in_base[count, 0] = (ray[0, 0] * u + start_x) * depth + origin[0]
+                xyz_in_base[count, 1] = (ray[1, 0] * u + start_y) * depth + origin[1]
+                xyz_in_base[count, 2] = (ray[2, 0] * u + start_z) * depth + origin[2]
+                colours[count, 0] = rgb[k, i, j, 0]
+                colours[count, 1] = rgb[k, i, j, 1]
+                colours[count, 2] = rgb[k, i, j, 2]
+                count += 1
+    return count

@@ -1,0 +1,208 @@
+"""Five orthographic virtual views of a point cloud (RVT section 3.1; paper section 3.2).
+
+The cube [-1, 1]^3 is the scene. Each view looks along one axis from a face of the cube and shows
+it edge to edge, so image coordinates and depth are cube coordinates up to scale and sign: no
+camera model is needed. Every cloud point is a square of 2 x 2 pixels and the nearest point wins
+(D-splat: RVT blends the five nearest discs). On equal depth the point with the lower index wins.
+
+view    camera at   u (px)      v (px)      depth       with h = pixels / 2
+top     +z          h (1 + x)   h (1 - y)   1 - z
+front   +y          h (1 - x)   h (1 - z)   1 - y
+back    -y          h (1 + x)   h (1 - z)   1 + y
+left    +x          h (1 + y)   h (1 - z)   1 - x
+right   -x          h (1 - y)   h (1 - z)   1 + x
+
+Coordinates are continuous: pixel k covers [k, k + 1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+
+from baselines.compiled import compiled
+from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
+
+VIEWS = ("top", "front", "back", "left", "right")
+"""Names and order of the views."""
+
+CHANNELS = ("x", "y", "z", "red", "green", "blue", "depth")
+"""Position in the cube frame, colour in [0, 1], depth less its mean over the view's points."""
+
+U_AXIS, U_SIGN = (0, 0, 0, 1, 1), (1, -1, 1, 1, -1)
+V_AXIS = (1, 2, 2, 2, 2)  # v always points against its axis
+DEPTH_AXIS, CAMERA_SIDE = (2, 1, 1, 0, 0), (1, 1, -1, 1, -1)
+
+EMPTY_DEPTH = -1.0
+"""Depth where no point is seen; the other channels are 0 there."""
+
+INDEX_BITS = 27
+DEPTH_STEPS = 2.0**24  # 1 - c is a multiple of 2^-24 for each float32 c in [-1, 1]
+NOTHING = np.int64(2**62)
+PLUS, MINUS = np.float32(1), np.float32(-1)  # the side a camera looks from
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig:
+    """How large the virtual views are."""
+
+    pixels: int = 128
+    """Pixels per side; RVT and the paper use 220."""
+
+
+def cube_from_base(bounds: SceneBounds = SCENE_BOUNDS) -> Float32[np.ndarray, "3 4"]:
+    """Affine map from the base frame (m) to cube coordinates."""
+    scale = 2.0 / bounds.side_m
+    shift = -scale * np.asarray(bounds.center_in_base)
+    return np.column_stack([scale * np.eye(3), shift]).astype(np.float32)
+
+
+def base_from_cube(
+    points_in_cube: Float[torch.Tensor, "*b 3"], bounds: SceneBounds = SCENE_BOUNDS
+) -> Float[torch.Tensor, "*b 3"]:
+    """Cube coordinates back to metres in the base frame."""
+    center = points_in_cube.new_tensor(bounds.center_in_base)
+    return points_in_cube * (bounds.side_m / 2) + center
+
+
+def project(
+    points_in_cube: Float[torch.Tensor, "*b 3"], pixels: int
+) -> Float[torch.Tensor, "*b 5 2"]:
+    """Continuous pixel coordinates (u, v) of points in each view."""
+    signs = points_in_cube.new_tensor(U_SIGN)
+    u = 1 + signs * points_in_cube[..., list(U_AXIS)]
+    v = 1 - points_in_cube[..., list(V_AXIS)]
+    return torch.stack([u, v], dim=-1) * (pixels / 2)
+
+
+def render_views(
+    xyz: Float32[np.ndarray, "n 3"],
+    rgb: UInt8[np.ndarray, "n 3"],
+    transform: Float32[np.ndarray, "3 4"],
+    pixels: int,
+    out: Float32[np.ndarray, "5 7 h w"] | None = None,
+) -> Float32[np.ndarray, "5 7 h w"]:
+    """Draw the cloud into the five views; single-threaded, deterministic, without the GIL.
+
+    Args:
+        xyz: points in any frame (m).
+        rgb: their colours.
+        transform: from that frame to the cube, augmentation included; points that land outside
+            [-1, 1]^3 or are not finite are dropped, so none at all gives five empty views.
+        pixels: side of each view.
+        out: memory to draw into (a slice of a batch saves allocating it anew).
+    """
+    if out is None:
+        out = np.empty((len(VIEWS), len(CHANNELS), pixels, pixels), np.float32)
+    _render(xyz, rgb, transform, out)
+    return out
+
+
+@compiled
+def _render(xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, out: np.ndarray) -> None:
+    pixels = out.shape[2]
+    points = np.empty((len(xyz), 6), np.float32)
+    cells = np.empty((len(xyz), 3), np.int32)
+    count = _place(xyz, rgb, transform, pixels, points, cells)
+    points, cells = points[:count], cells[:count]
+    nearest = np.empty((2, pixels + 2, pixels + 2), np.int64)
+    _splat(points, cells, 0, 1, 2, nearest)
+    _paint(points, nearest[0], 2, PLUS, 1, out[0])
+    _splat(points, cells, 0, 2, 1, nearest)
+    _paint(points, nearest[0], 1, PLUS, -1, out[1])
+    _paint(points, nearest[1], 1, MINUS, 1, out[2])
+    _splat(points, cells, 1, 2, 0, nearest)
+    _paint(points, nearest[0], 0, PLUS, 1, out[3])
+    _paint(points, nearest[1], 0, MINUS, -1, out[4])
+
+
+@compiled
+def _place(
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    transform: np.ndarray,
+    pixels: int,
+    points: np.ndarray,
+    cells: np.ndarray,
+) -> int:
+    """Keep the points inside the cube: their features and the first cell each covers per axis.
+
+    Cells are counted from 0 for the margin outside the cube, so both cells of a point exist.
+    """
+    half, one = np.float32(pixels / 2), np.float32(1)
+    count = 0
+    for i in range(len(xyz)):
+        px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        x = transform[0, 0] * px + transform[0, 1] * py + transform[0, 2] * pz + transform[0, 3]
+        y = transform[1, 0] * px + transform[1, 1] * py + transform[1, 2] * pz + transform[1, 3]
+        z = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2] * pz + transform[2, 3]
+        if not (abs(x) <= one and abs(y) <= one and abs(z) <= one):
+            continue
+        points[count, 0], points[count, 1], points[count, 2] = x, y, z
+        for c in range(3):
+            points[count, 3 + c] = np.float32(rgb[i, c]) / np.float32(255)
+            cells[count, c] = np.int32(half * (one + points[count, c]) + np.float32(0.5))
+        count += 1
+    return count
+
+
+@compiled
+def _splat(
+    points: np.ndarray,
+    cells: np.ndarray,
+    column_axis: int,
+    row_axis: int,
+    depth_axis: int,
+    nearest: np.ndarray,
+) -> None:
+    """Find the nearest point of each cell seen from the + side (0) and the - side (1).
+
+    An entry is depth in units of 2^-24 followed by the point's index, so that the smaller entry
+    is the nearer point and, on equal depth, the earlier one.
+    """
+    nearest[:] = NOTHING
+    one, steps = np.float32(1), np.float32(DEPTH_STEPS)
+    for i in range(len(points)):
+        along = points[i, depth_axis]
+        plus = (np.int64((one - along) * steps) << INDEX_BITS) | i
+        minus = (np.int64((one + along) * steps) << INDEX_BITS) | i
+        row, column = cells[i, row_axis], cells[i, column_axis]
+        for r in range(row, row + 2):
+            for c in range(column, column + 2):
+                nearest[0, r, c] = min(nearest[0, r, c], plus)
+                nearest[1, r, c] = min(nearest[1, r, c], minus)
+
+
+@compiled
+def _paint(
+    points: np.ndarray,
+    nearest: np.ndarray,
+    depth_axis: int,
+    side: np.float32,
+    u_sign: int,
+    view: np.ndarray,
+) -> None:
+    """Gather the features of the nearest points into one view (7, h, w)."""
+    pixels = view.shape[1]
+    total, covered = 0.0, 0
+    for v in range(pixels):
+        for u in range(pixels):
+            column = u + 1 if u_sign > 0 else pixels - u
+            entry = nearest[pixels - v, column]
+            if entry == NOTHING:
+                view[:, v, u] = 0
+                continue
+            i = entry & ((1 << INDEX_BITS) - 1)
+            for c in range(6):
+                view[c, v, u] = points[i, c]
+            depth = np.float32(1) - side * points[i, depth_axis]
+            view[6, v, u] = depth
+            total += depth
+            covered += 1
+    mean = np.float32(total / max(covered, 1))
+    for v in range(pixels):
+        for u in range(pixels):
+            column = u + 1 if u_sign > 0 else pixels - u
+            empty = nearest[pixels - v, column] == NOTHING
+            view[6, v, u] = EMPTY_DEPTH if empty else view[6, v, u] - mean
