@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol
 
 from torch import Tensor, nn
 
+from baselines.augment import AugmentConfig
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError, find_name
@@ -53,11 +54,8 @@ class Recipe:
     heatmap_sigma_px: float = 1.5
     """Width of the Gaussian over a view's pixels."""
 
-    max_yaw_deg: float = 45.0
-    """Yaw augmentation of cloud and action together, uniform in +- this angle."""
-
-    max_shift_m: float = 0.125
-    """Translation augmentation, uniform in +- this distance on each axis."""
+    augment: AugmentConfig = AugmentConfig()
+    """Random rigid moves of cloud and action together."""
 
     image_noise: float = 0.0
     """Largest amplitude of the uniform noise added to the views (RVT: 0.1)."""
@@ -67,6 +65,19 @@ class Recipe:
 
     text: str = "minilm"
     """Frozen text encoder: `minilm`, or `clip:<hub id or local folder>`."""
+
+    def __post_init__(self) -> None:
+        """Reject values that cannot train.
+
+        Raises:
+            UsageError: names the field, what it may be and what came.
+        """
+        if self.batch < 2:
+            raise UsageError(f"recipe.batch must hold two sizes, so at least 2, not {self.batch}.")
+        if self.samples < self.batch:
+            raise UsageError(
+                f"recipe.samples ({self.samples}) is less than a batch ({self.batch})."
+            )
 
 
 class AgentConfig(Protocol):
@@ -82,7 +93,7 @@ class AgentConfig(Protocol):
 
 
 class Network(nn.Module):
-    """A keyframe predictor. Dropout draws from torch's global generator, which the trainer seeds."""
+    """A keyframe predictor; dropout draws from torch's global generator, seeded every step."""
 
     needs_goals: bool = False
     """Whether `loss` reads `Batch.goal_views`."""

@@ -68,3 +68,8 @@ class Prediction:
     quaternion_wxyz: Float[Tensor, "b 4"]
     gripper_open: Bool[Tensor, "b"]
     ignore_collisions: Bool[Tensor, "b"]
+
+
+def proprio(*, gripper_open: bool, step: int, max_steps: int) -> tuple[float, float]:
+    """One row of `Inputs.proprio`; time runs from 1 down to -1 over the keyframe budget."""
+    return float(gripper_open), 1 - 2 * step / (max_steps - 1)

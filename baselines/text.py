@@ -5,7 +5,6 @@ every keyframe file, and in `text.safetensors` of every checkpoint. So neither t
 evaluation of known sentences loads an encoder. Padding is masked: D-text-padding.
 """
 
-import hashlib
 import importlib.util
 import json
 import logging
@@ -70,7 +69,7 @@ class TextEncoder:
         """Use `load_encoder`."""
         self.spec = spec
         self._tokenizer = tokenizer
-        self._tower = tower.eval().requires_grad_(False)
+        self._tower = tower.eval().requires_grad_(requires_grad=False)
 
     def encode(self, sentence: str) -> Tokens:
         """Token vectors of `sentence`; the last one is the end-of-text token.
@@ -157,7 +156,7 @@ def _clip_folder(name: str) -> Path:
 
 def _clip_snapshot(hub_id: str) -> Path:
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HFValidationError, HfHubHTTPError, LocalEntryNotFoundError
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
         return Path(snapshot_download(hub_id, allow_patterns=list(CLIP_PATTERNS)))

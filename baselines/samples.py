@@ -1,0 +1,185 @@
+"""Keyframe files -> samples: which keyframe is shown at which step.
+
+Images stay in memory as stored (RGB u8, depth u16: 330 KB an observation), one shard a task.
+What is drawn is a pure function of (seed, step), so a resumed run sees what an unbroken one saw.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from sacil_tasks.errors import UsageError
+from sacil_tasks.interface import MAX_KEYFRAMES, Observation
+from sacil_tasks.keyframes import OBSERVATION_COLUMNS, Episode, KeyframeFile
+
+STREAMS = ("rows", "moves", "goals", "noise", "torch")
+"""Random streams of a step: one more stream never changes what another draws."""
+
+
+def stream(seed: int, step: int, name: str) -> np.random.Generator:
+    """The generator of one purpose at one step."""
+    return np.random.default_rng([seed, step, STREAMS.index(name)])
+
+
+class Sample(NamedTuple):
+    """One observation with a keyframe to be reached from it."""
+
+    shard: int
+    row: int
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One task's keyframe file in memory."""
+
+    task: str
+    path: Path
+    content_sha256: str
+    episodes: Sequence[Episode]
+    first_rows: Sequence[int]
+    columns: dict[str, np.ndarray]
+    """Datasets of `observations/` by name, all rows."""
+
+    @classmethod
+    def load(cls, path: Path) -> "Shard":
+        """Read a whole keyframe file.
+
+        Raises:
+            UsageError: missing, truncated, foreign or empty file.
+        """
+        with KeyframeFile.open(path) as file:
+            columns = {name: file.column(name) for name in OBSERVATION_COLUMNS}
+            task, sha256 = file.meta.task, file.content_sha256
+            episodes, first_rows = file.episodes, file.first_rows
+        if not episodes:
+            raise UsageError(f"{path} holds no demos. {_gen_demos(task)}")
+        return cls(task, path, sha256, episodes, first_rows, columns)
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self.episodes)
+
+    @cached_property
+    def meanings(self) -> Sequence[str]:
+        """Task and slots of each episode as one word: equal whatever the sentence."""
+        return [f"{self.task} {json.dumps(e.slots, sort_keys=True)}" for e in self.episodes]
+
+    def keyframes(self, episode: int) -> range:
+        """Rows of an episode that have a keyframe to be reached."""
+        first = self.first_rows[episode]
+        return range(first, first + self._rows[episode] - 1)
+
+    @cached_property
+    def _rows(self) -> Sequence[int]:
+        return np.bincount(self.columns["episode_id"], minlength=len(self.episodes)).tolist()
+
+    def observation(self, row: int) -> Observation:
+        """The observation of `row`, as a policy would have seen it; nothing is copied."""
+        c = self.columns
+        return Observation(
+            rgb=c["rgb"][row],
+            depth_mm=c["depth_mm"][row],
+            intrinsics=c["intrinsics"][row],
+            camera_in_base=c["camera_in_base"][row],
+            tcp_in_base=c["tcp_in_base"][row],
+            gripper_open=bool(c["gripper_open"][row]),
+            step=int(c["step"][row]),
+            max_steps=MAX_KEYFRAMES,
+        )
+
+    def target_in_base(self, row: int) -> Float32[np.ndarray, "7"]:
+        """Pose of the keyframe to be reached; at an episode's end the gripper's own pose."""
+        target = self.columns["keyframe_in_base"][row]
+        return target if np.isfinite(target).all() else self.columns["tcp_in_base"][row]
+
+
+class KeyframeSet:
+    """The keyframes of several tasks, drawn so that every task and every demo weighs the same."""
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        """Use `load` for files on disk."""
+        self.shards = tuple(shards)
+
+    @classmethod
+    def load(cls, folder: Path, tasks: Sequence[str]) -> "KeyframeSet":
+        """Read `<folder>/<task>.h5` of every task.
+
+        Raises:
+            UsageError: a file is missing (says how to make it), truncated or foreign.
+        """
+        missing = [task for task in tasks if not (folder / f"{task}.h5").is_file()]
+        if missing:
+            raise UsageError(
+                f"no keyframes of {', '.join(missing)} in {folder}. " + _gen_demos(*missing)
+            )
+        return cls([Shard.load(folder / f"{task}.h5") for task in tasks])
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Tasks in the order of `Sample.shard`."""
+        return tuple(shard.task for shard in self.shards)
+
+    @cached_property
+    def meaning_ids(self) -> dict[str, int]:
+        """A number for each task and slots."""
+        words = {meaning for shard in self.shards for meaning in shard.meanings}
+        return {word: number for number, word in enumerate(sorted(words))}
+
+    def meaning(self, sample: Sample) -> str:
+        """Task and slots of a sample."""
+        return self.shards[sample.shard].meanings[self.episode(sample)]
+
+    def episode(self, sample: Sample) -> int:
+        """Index of a sample's episode within its shard."""
+        return int(self.shards[sample.shard].columns["episode_id"][sample.row])
+
+    def everything(self) -> list[Sample]:
+        """All samples in file order."""
+        return [
+            Sample(number, row)
+            for number, shard in enumerate(self.shards)
+            for episode in range(len(shard))
+            for row in shard.keyframes(episode)
+        ]
+
+    def draw(self, rng: np.random.Generator, count: int) -> list[Sample]:
+        """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
+
+        A draw without two sizes of one task is repeated: such a batch would let a contrast be
+        solved by task identity.
+
+        Raises:
+            UsageError: no task has demos of two sizes.
+        """
+        self._require_two_meanings()
+        while True:
+            samples = [self._draw_one(rng) for _ in range(count)]
+            if self._tells_sizes_apart(samples):
+                return samples
+
+    def _draw_one(self, rng: np.random.Generator) -> Sample:
+        number = int(rng.integers(len(self.shards)))
+        shard = self.shards[number]
+        rows = shard.keyframes(int(rng.integers(len(shard))))
+        return Sample(number, rows[int(rng.integers(len(rows)))])
+
+    def _tells_sizes_apart(self, samples: Sequence[Sample]) -> bool:
+        meanings = {self.meaning(sample) for sample in samples}
+        return len(meanings) > len({sample.shard for sample in samples})
+
+    def _require_two_meanings(self) -> None:
+        if len(self.meaning_ids) == len(self.shards):
+            raise UsageError(
+                "every task has demos of a single size only, so nothing about size can be learnt. "
+                + _gen_demos(*self.tasks)
+            )
+
+
+def _gen_demos(*tasks: str) -> str:
+    return f"Run `python -m sacil_tasks.gen_demos --tasks {' '.join(tasks)}`."
