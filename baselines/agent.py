@@ -54,7 +54,7 @@ class Recipe:
     heatmap_sigma_px: float = 1.5
     """Width of the Gaussian over a view's pixels."""
 
-    augment: AugmentConfig = AugmentConfig()
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
     """Random rigid moves of cloud and action together."""
 
     image_noise: float = 0.0
@@ -73,7 +73,7 @@ class Recipe:
             UsageError: names the field, what it may be and what came.
         """
         if self.batch < 2:
-            raise UsageError(f"recipe.batch must hold two sizes, so at least 2, not {self.batch}.")
+            raise UsageError(f"recipe.batch must be at least 2 (two sizes), not {self.batch}.")
         if self.samples < self.batch:
             raise UsageError(
                 f"recipe.samples ({self.samples}) is less than a batch ({self.batch})."

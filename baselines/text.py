@@ -109,16 +109,15 @@ def load_encoder(name: str) -> TextEncoder:
 
     transformers.logging.set_verbosity_error()
     transformers.logging.disable_progress_bar()
+    tower: torch.nn.Module
     if name == "minilm":
-        folder = _minilm_folder()
+        spec, folder = text_spec(name), _minilm_folder()
         tower = transformers.BertModel.from_pretrained(folder, add_pooling_layer=False)
-        return TextEncoder(
-            text_spec(name), transformers.BertTokenizerFast.from_pretrained(folder), tower
-        )
-    folder = _clip_folder(name)
-    tower = transformers.CLIPTextModel.from_pretrained(folder, use_safetensors=True)
-    tokenizer = transformers.CLIPTokenizerFast.from_pretrained(folder)
-    return TextEncoder(_clip_spec(name, folder), tokenizer, tower.float())
+    else:
+        folder = _clip_folder(name)
+        spec = _clip_spec(name, folder)
+        tower = transformers.CLIPTextModel.from_pretrained(folder, use_safetensors=True)
+    return TextEncoder(spec, transformers.AutoTokenizer.from_pretrained(folder), tower.float())
 
 
 def _minilm_folder() -> Path:
