@@ -1,0 +1,1 @@
+"""Motion: from a keyframe to joint targets, on Pinocchio, coal, OMPL and toppra."""

@@ -1,0 +1,176 @@
+"""From keyframes to control steps: plan, move, then the gripper acts, then everything settles."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gymnasium as gym
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float64
+from mani_skill.envs.sapien_env import BaseEnv
+
+from sacil_tasks.interface import SCENE_BOUNDS, Keyframe
+from sacil_tasks.motion.collision import OPEN_M, CollisionWorld, MotionState, read_robot
+from sacil_tasks.motion.kinematics import ARM_JOINTS, Joints, PandaArm, Path
+from sacil_tasks.motion.planner import Planner, Refusal, timed
+from sacil_tasks.motion.shapes import to_se3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorConfig:
+    """When a motion counts as finished."""
+
+    settle_steps: int = 10
+    """Control steps the arm is waited for at most, after its last target."""
+
+    gripper_steps: int = 10
+    """Control steps the fingers are waited for at most."""
+
+    still_rad_s: float = 0.01
+    """Joints slower than this stand still (fingers: m/s, a tenth of it)."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the arm will move."""
+
+    path: Path
+    """Waypoints; collision-free between them."""
+
+    targets: Path
+    """One joint target per control step."""
+
+
+class KeyframeExecutor:
+    """Executes keyframes in one environment; experts and policies alike act through it.
+
+    Call `begin` after every reset of the environment. All motion goes through `env.step`, so a
+    wrapper that records actions records these.
+    """
+
+    def __init__(self, env: gym.Env, config: ExecutorConfig | None = None) -> None:
+        self._env = env
+        self._base: BaseEnv = env.unwrapped
+        self._config = config or ExecutorConfig()
+        self._arm = PandaArm()
+        self._robot = read_robot(self._base)
+
+    def begin(self) -> None:
+        """Read the scene as it is now."""
+        self._world = CollisionWorld(self._arm, self._robot, self._base)
+        self._planner = Planner(self._arm, self._world)
+        self._gripper_open = bool(self._fingers().mean() > 0.9 * OPEN_M)
+
+    def plan(self, keyframe: Keyframe) -> Plan | Refusal:
+        """How to reach a keyframe from the present state, or why that is impossible.
+
+        A plan that respects collisions and fails is refused; it is never retried without.
+        """
+        path = self._path(keyframe, self._state())
+        if isinstance(path, Refusal):
+            return path
+        return Plan(path, timed(path, self._base.control_freq))
+
+    def execute(self, keyframe: Keyframe) -> Refusal | None:
+        """Move the arm, then the gripper; a refusal means that nothing has moved."""
+        plan = self.plan(keyframe)
+        if isinstance(plan, Refusal):
+            return plan
+        for target in plan.targets:
+            self._step(target)
+        self._settle(plan.targets[-1])
+        if keyframe.gripper_open != self._gripper_open:
+            self._move_gripper(plan.targets[-1], gripper_open=keyframe.gripper_open)
+        return None
+
+    def plan_sequence(self, keyframes: Sequence[Keyframe]) -> Refusal | None:
+        """Whether all keyframes can be reached one after the other, without simulation.
+
+        A movable body between the closing fingers goes with the hand until they open.
+        """
+        state, gripper_open = self._state(), self._gripper_open
+        for keyframe in keyframes:
+            path = self._path(keyframe, state)
+            if isinstance(path, Refusal):
+                return path
+            state = self._after(state, path[-1])
+            if keyframe.gripper_open != gripper_open:
+                state = self._with_gripper(state, gripper_open=keyframe.gripper_open)
+                gripper_open = keyframe.gripper_open
+        return None
+
+    def _path(self, keyframe: Keyframe, state: MotionState) -> Path | Refusal:
+        target = _to_pose(keyframe)
+        if isinstance(target, Refusal):
+            return target
+        return self._planner.path(state, target, ignore_obstacles=keyframe.ignore_collisions)
+
+    def _after(self, state: MotionState, joints: Joints) -> MotionState:
+        bodies = list(state.bodies_in_base)
+        if state.held is not None:
+            moved = self._arm.tcp_in_base(joints) * self._arm.tcp_in_base(state.joints).inverse()
+            bodies[state.held] = moved * bodies[state.held]
+        return replace(state, joints=joints, bodies_in_base=tuple(bodies))
+
+    def _with_gripper(self, state: MotionState, *, gripper_open: bool) -> MotionState:
+        if gripper_open:
+            return replace(state, finger_m=OPEN_M, held=None)
+        # The fingers stay apart in the plan: wider than they will be, so on the safe side.
+        held = self._world.body_between_fingers(state)
+        return replace(state, held=held, finger_m=0.0 if held is None else state.finger_m)
+
+    def _state(self) -> MotionState:
+        world_in_base = to_se3(self._base.agent.robot.pose.sp).inverse()
+        state = MotionState(
+            joints=self._joints(),
+            finger_m=float(self._fingers().mean()),
+            bodies_in_base=tuple(
+                world_in_base * to_se3(body.entity.pose) for body in self._world.bodies
+            ),
+            held=None,
+        )
+        if self._gripper_open:
+            return state
+        return replace(state, held=self._world.body_between_fingers(state))
+
+    def _settle(self, target: Joints) -> None:
+        for _ in range(self._config.settle_steps):
+            self._step(target)
+            if self._speeds()[:ARM_JOINTS].max() < self._config.still_rad_s:
+                return
+
+    def _move_gripper(self, target: Joints, *, gripper_open: bool) -> None:
+        self._gripper_open = gripper_open
+        for _ in range(self._config.gripper_steps):
+            self._step(target)
+            if self._speeds()[ARM_JOINTS:].max() < self._config.still_rad_s / 10:
+                return
+
+    def _step(self, target: Joints) -> None:
+        gripper = 1.0 if self._gripper_open else -1.0
+        self._env.step(np.append(target, gripper).astype(np.float32))
+
+    def _joints(self) -> Joints:
+        return self._positions()[:ARM_JOINTS]
+
+    def _fingers(self) -> Float64[np.ndarray, "2"]:
+        return self._positions()[ARM_JOINTS:]
+
+    def _positions(self) -> Float64[np.ndarray, "9"]:
+        return self._base.agent.robot.get_qpos()[0].numpy().astype(float)
+
+    def _speeds(self) -> Float64[np.ndarray, "9"]:
+        return np.abs(self._base.agent.robot.get_qvel()[0].numpy().astype(float))
+
+
+def _to_pose(keyframe: Keyframe) -> pin.SE3 | Refusal:
+    position = np.asarray(keyframe.position_m, dtype=float)
+    quaternion = np.asarray(keyframe.quaternion_wxyz, dtype=float)
+    length = np.linalg.norm(quaternion)
+    if not (np.isfinite(position).all() and np.isfinite(quaternion).all() and length > 1e-6):
+        return Refusal("not_finite")
+    offset = np.abs(position - np.array(SCENE_BOUNDS.center_in_base)).max()
+    if offset > SCENE_BOUNDS.side_m / 2:
+        return Refusal("outside_workspace")
+    w, x, y, z = (float(value) for value in quaternion / length)
+    return pin.SE3(pin.Quaternion(w, x, y, z), position)
