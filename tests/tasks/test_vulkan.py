@@ -1,6 +1,7 @@
 """The renderer's verdict: what a machine without Vulkan, or with an old Mesa, is told."""
 
 import pytest
+
 from sacil_tasks import vulkan
 from sacil_tasks.errors import UsageError
 from sacil_tasks.vulkan import VulkanDevice, explain_render_failure, find_devices, find_problem
