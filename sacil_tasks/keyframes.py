@@ -150,31 +150,37 @@ def write_demo(group: h5py.Group, demo: KeyframeDemo, *, episode_id: int, first_
         group[f"episodes/{name}"][episode_id] = cell
 
 
-def copy_demo(source: h5py.Group, target: h5py.Group, *, episode_id: int, first_row: int) -> int:
-    """Copy the only demo of `source`, images as packed; return the number of its rows."""
-    count = int(source["episodes/rows"][0])
-    rows = slice(first_row, first_row + count)
-    shift = {"episode_id": episode_id, "next_index": first_row}
+def copy_demo(
+    source: h5py.Group, target: h5py.Group, *, episode: int, episode_id: int, first_row: int
+) -> int:
+    """Copy demo `episode` of `source`, images still packed; return the number of its rows."""
+    start, count = (int(source[f"episodes/{name}"][episode]) for name in ("first_row", "rows"))
     for name in OBSERVATION_COLUMNS:
         column, into = source[f"observations/{name}"], target[f"observations/{name}"]
         if name in IMAGE_COLUMNS:
-            _copy_chunks(column, into, first_row)
-            continue
-        values = column[:]
-        if name in shift:
-            values[values != NO_ROW] += shift[name]
-        into[rows] = values
+            _copy_chunks(column, into, range(start, start + count), first_row)
+        else:
+            into[first_row : first_row + count] = column[start : start + count]
+    last = first_row + count
+    target["observations/episode_id"][first_row:last] = episode_id
+    target["observations/next_index"][first_row:last] = _next_rows(first_row, count)
     for name in EPISODE_COLUMNS:
-        cell = source[f"episodes/{name}"][0]
-        target[f"episodes/{name}"][episode_id] = first_row if name == "first_row" else cell
+        target[f"episodes/{name}"][episode_id] = source[f"episodes/{name}"][episode]
+    target["episodes/first_row"][episode_id] = first_row
     return count
 
 
-def _copy_chunks(source: h5py.Dataset, target: h5py.Dataset, first_row: int) -> None:
+def _copy_chunks(
+    source: h5py.Dataset, target: h5py.Dataset, rows: Sequence[int], first_row: int
+) -> None:
     tail = (0,) * (source.ndim - 1)
-    for row in range(len(source)):
+    for offset, row in enumerate(rows):
         mask, chunk = source.id.read_direct_chunk((row, *tail))
-        target.id.write_direct_chunk((first_row + row, *tail), chunk, mask)
+        target.id.write_direct_chunk((first_row + offset, *tail), chunk, mask)
+
+
+def _next_rows(first_row: int, count: int) -> list[int]:
+    return [*range(first_row + 1, first_row + count), NO_ROW]
 
 
 def seal(file: h5py.File, meta: KeyframeMeta) -> None:
@@ -222,7 +228,7 @@ def _observation_columns(
         "gripper_open": np.array([o.gripper_open for o in seen]),
         "step": np.array([o.step for o in seen]),
         "episode_id": np.full(count, episode_id),
-        "next_index": np.array([*range(first_row + 1, first_row + count), NO_ROW]),
+        "next_index": np.array(_next_rows(first_row, count)),
         "keyframe_in_base": np.array([*commanded, np.full(7, np.nan)]),
         "keyframe_open": np.array([*(k.gripper_open for k in asked), False]),
         "keyframe_ignore_collisions": np.array([*(k.ignore_collisions for k in asked), False]),

@@ -124,7 +124,7 @@ def test_merging_packed_demos_equals_writing_them_together(path, demos, tmp_path
         create_tables(merged, rows=7, episodes=2)
         first_row = 0
         for number, part in enumerate(parts):
-            first_row += copy_demo(part, merged, episode_id=number, first_row=first_row)
+            first_row += copy_demo(part, merged, episode=0, episode_id=number, first_row=first_row)
         seal(merged, META)
     with KeyframeFile.open(path) as whole, KeyframeFile.open(tmp_path / "merged.h5") as merged:
         assert merged.content_sha256 == whole.content_sha256

@@ -1,0 +1,189 @@
+"""Scene + words -> an episode that keyframes act on. Demos and evaluation both run on a `Stage`.
+
+A scene index names the first of its attempts in which the expert can plan *every* variation, at
+canonical sizes, from the home pose. So which scene it is depends on no word, split or worker.
+"""
+
+import hashlib
+import json
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sacil_tasks.cameras import observe
+from sacil_tasks.catalog import env_id, task_spec
+from sacil_tasks.errors import UsageError
+from sacil_tasks.instructions import Slots, draw_words, variations
+from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Observation
+from sacil_tasks.motion.executor import KeyframeExecutor
+from sacil_tasks.outcomes import Outcome
+from sacil_tasks.recording import StepRecorder
+from sacil_tasks.scenes import ATTEMPTS, scene_seed, stream
+from sacil_tasks.table import SizedTableEnv
+
+ENV_KWARGS = {"obs_mode": "none", "control_mode": "pd_joint_pos", "sim_backend": "physx_cpu"}
+"""How the environment is made, here and by whoever replays a demo."""
+
+
+@dataclass(frozen=True)
+class SceneKey:
+    """Name of a scene."""
+
+    task: str
+    partition: str
+    scene_set: int
+    index: int
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one keyframe led to, after everything has settled."""
+
+    refusal: str | None
+    """Why the keyframe was not executed, or None."""
+
+    success: bool
+    """The task is solved and nothing unnamed was disturbed."""
+
+    success_lenient: bool
+    """The task is solved."""
+
+
+class Stage:
+    """One environment with an arm that takes keyframes; runs episode after episode."""
+
+    def __init__(self, task: str, *, render: bool = True) -> None:
+        """Start the simulator; without `render`, `observe` is not available.
+
+        Raises:
+            UsageError: the task is unknown, or nothing here can render.
+        """
+        self.task = task
+        self.spec = task_spec(task)
+        self.recorder = StepRecorder(_make(task, render=render))
+        self.env: SizedTableEnv = self.recorder.unwrapped
+        self.attempt = 0
+        """Attempts of the running scene that were rejected, for the acceptance rate."""
+        self.seed = 0
+        """Environment seed of the running episode."""
+        self.options: dict[str, Any] = {}
+        """Reset options of the running episode."""
+        self._executor = KeyframeExecutor(self.recorder)
+        self._accepted: dict[SceneKey, int] = {}
+        self._seconds = Counter[str]()
+        self._steps = 0
+        self._gripper_open = True
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds spent so far on scenes (reset and acceptance), planning, physics, rendering."""
+        spent = dict(self._seconds) | {"physics": self.recorder.physics_s}
+        spent["planning"] = spent.pop("execution", 0.0) - self.recorder.physics_s
+        return spent
+
+    def begin(
+        self, scene: SceneKey, *, variation: int, template: int | None = None, split: str = "canon"
+    ) -> str:
+        """Start an episode and return its instruction.
+
+        `template` None: as the scene's instruction stream draws it.
+        """
+        started = time.perf_counter()
+        slots = variations(self.spec)[variation]
+        known = scene in self._accepted
+        if not known:
+            self._accepted[scene] = self._find_attempt(scene, slots, template)
+        if known or split != "canon":
+            self._reset(scene, self._accepted[scene], slots, template, split)
+        self._seconds["scenes"] += time.perf_counter() - started
+        return self.env.get_language_instruction()[0]
+
+    def observe(self) -> Observation:
+        """Render all cameras now."""
+        started = time.perf_counter()
+        observation = observe(
+            self.env, step=self._steps, max_steps=MAX_KEYFRAMES, gripper_open=self._gripper_open
+        )
+        self._seconds["rendering"] += time.perf_counter() - started
+        return observation
+
+    def execute(self, keyframe: Keyframe) -> StepResult:
+        """Plan, move, set the gripper and let everything settle."""
+        started = time.perf_counter()
+        refusal = self._executor.execute(keyframe)
+        self._seconds["execution"] += time.perf_counter() - started
+        self._steps += 1
+        if refusal is None:
+            self._gripper_open = keyframe.gripper_open
+        state = self.env.evaluate()
+        return StepResult(
+            refusal=refusal and refusal.reason,
+            success=bool(state["success"]),
+            success_lenient=bool(state["success_lenient"]),
+        )
+
+    def expert_keyframe(self, index: int, choice: tuple[int, ...] | None = None) -> Keyframe:
+        """Keyframe `index` of the expert, who handles the candidates `choice`: those named."""
+        return self.env.expert_keyframe(index, choice or self.env.target_order())
+
+    def outcome(self) -> Outcome:
+        """What has happened so far."""
+        return self.env.outcome()
+
+    def fingerprint(self) -> str:
+        """Hash of geometry, poses (rounded to 1e-6) and words: equal scenes have equal ones."""
+        numbers = {
+            "sizes_m": self.env.sizes_m,
+            "candidate_in_base": self.env.candidate_in_base(),
+        }
+        rounded = {name: np.round(value, 6).tolist() for name, value in numbers.items()}
+        content = json.dumps(rounded | {"words": self.env.get_language_instruction()})
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    def close(self) -> None:
+        """Stop the simulator."""
+        self.recorder.close()
+
+    def _find_attempt(self, scene: SceneKey, slots: Slots, template: int | None) -> int:
+        """The first attempt that the expert can plan; it has been reset."""
+        for attempt in range(ATTEMPTS):
+            self._reset(scene, attempt, slots, template, "canon")
+            if all(self._can_plan(choice) for choice in self._choices()):
+                return attempt
+        raise RuntimeError(f"the expert can plan none of the {ATTEMPTS} attempts of {scene}")
+
+    def _reset(
+        self, scene: SceneKey, attempt: int, slots: Slots, template: int | None, split: str
+    ) -> None:
+        self.attempt = attempt
+        self.seed = scene_seed(scene.partition, scene.scene_set, scene.task, scene.index, attempt)
+        if template is None:
+            template = draw_words(self.spec, stream(self.seed, "instruction"))[1]
+        self.options = {"slots": slots, "template": template, "split": split}
+        self.recorder.reset(seed=self.seed, options=dict(self.options))
+        self._executor.begin()
+        self._steps, self._gripper_open = 0, True
+
+    def _choices(self) -> list[tuple[int, ...]]:
+        """Candidates that each variation names."""
+        holder = {label: i for i, label in enumerate(self.env.candidate_labels)}
+        return [tuple(holder[w] for w in slots.values()) for slots in variations(self.spec)]
+
+    def _can_plan(self, choice: tuple[int, ...]) -> bool:
+        keyframes = [self.expert_keyframe(k, choice) for k in range(self.spec.keyframes)]
+        return self._executor.plan_sequence(keyframes) is None
+
+
+def _make(task: str, *, render: bool) -> gym.Env:
+    try:
+        return gym.make(
+            env_id(task), render_backend="cpu" if render else "none", **ENV_KWARGS
+        ).unwrapped
+    except RuntimeError as error:
+        raise UsageError(
+            f"nothing here can render ({error}). `python -m sacil_tasks.doctor` says what to do."
+        ) from error
