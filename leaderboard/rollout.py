@@ -1,0 +1,209 @@
+"""One episode: a stage, an agent and an episode key -> an `EpisodeRecord`.
+
+Whatever the agent does ends as a record: an exception is an error, a keyframe that is not finite,
+out of reach or in collision is an invalid action. Both count as failures.
+"""
+
+import hashlib
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import sapien
+
+from leaderboard.entry import Entry
+from leaderboard.film import Film
+from leaderboard.plan import SceneJob
+from leaderboard.probes import Probe
+from leaderboard.records import (
+    BROKE_OFF,
+    ERROR,
+    INVALID_ACTION,
+    LIMIT,
+    SUCCEEDED,
+    EpisodeKey,
+    EpisodeRecord,
+    Seconds,
+)
+from sacil_tasks.episode import SceneKey, Stage
+from sacil_tasks.errors import UsageError
+from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Memory, Policy
+
+
+@dataclass
+class _Course:
+    """How far an episode has come; filled as it goes, so that an exception loses nothing."""
+
+    end: str = LIMIT
+    reason: str = ""
+    keyframes: int = 0
+    success: bool = False
+    success_lenient: bool = False
+    pixels: str = ""
+    renderer: str = ""
+    inference_s: float = 0.0
+
+
+class SceneRunner:
+    """Plays scene after scene with one agent; keeps a stage while its task lasts."""
+
+    def __init__(self, policy: Policy | Probe, entry: Entry, videos: Path | None) -> None:
+        """Nothing is started yet; `videos` is the folder for one video per episode, or None."""
+        self._policy, self._entry, self._videos = policy, entry, videos
+        self._stage: Stage | None = None
+        self._film: Film | None = None
+
+    def play(self, job: SceneJob) -> list[EpisodeRecord]:
+        """The records of one scene.
+
+        Raises:
+            UsageError: this machine cannot run the simulator.
+        """
+        return [self._play_one(key) for key in job.keys]
+
+    def _play_one(self, key: EpisodeKey) -> EpisodeRecord:
+        stage = self._stage_for(key.task)
+        record = run_episode(stage, self._policy, self._entry, key)
+        if self._film is not None and self._videos is not None:
+            self._film.save(self._videos, record)
+        if record.errored:
+            self._close()  # whatever broke, the next episode starts from a fresh simulator
+        return record
+
+    def _stage_for(self, task: str) -> Stage:
+        if self._stage is None or self._stage.task != task:
+            self._close()
+            # Probes do not look, so they run where nothing can render.
+            render = self._videos is not None or not self._entry.privileged
+            self._stage = Stage(task, render=render)
+            self._film = Film.of(self._stage) if self._videos else None
+        return self._stage
+
+    def _close(self) -> None:
+        self._film = None
+        if self._stage is not None:
+            self._stage.close()
+            self._stage = None
+
+
+def run_episode(
+    stage: Stage, policy: Policy | Probe, entry: Entry, key: EpisodeKey
+) -> EpisodeRecord:
+    """Play one episode; an exception on the way becomes part of the record.
+
+    Raises:
+        UsageError: this machine cannot run the simulator.
+    """
+    started, before = time.perf_counter(), stage.seconds
+    course, facts = _Course(), dict[str, Any]()
+    try:
+        facts |= _set(stage, key)
+        memory = _begin(stage, policy, entry, key, facts["instruction"])
+        _play(stage, policy, memory, course, privileged=entry.privileged)
+        facts |= _judge(stage)
+    except UsageError:
+        raise
+    except Exception as error:
+        course.end, course.reason = BROKE_OFF, describe(error)
+        course.success = course.success_lenient = False
+        facts |= {"outcome": ERROR, "asked": (), "handled": ()}
+    seconds = _seconds(started, before, stage.seconds, course)
+    return EpisodeRecord(**entry.identity(key), **facts, **_result(course), seconds=seconds)
+
+
+def describe(error: Exception) -> str:
+    """One line: what was raised and where."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}{place}"
+
+
+@cache
+def renderer() -> str:
+    """Name of the Vulkan device that draws."""
+    lines = sapien.render.get_device_summary().splitlines()
+    return "; ".join(line.removeprefix("GPU: ") for line in lines if line.startswith("GPU: "))
+
+
+def episode_rng(agent: str, key: EpisodeKey) -> np.random.Generator:
+    """The random stream of an agent in one episode, a function of their names."""
+    name = "/".join(map(str, (agent, *key)))
+    return np.random.default_rng(list(hashlib.sha256(name.encode()).digest()))
+
+
+def _set(stage: Stage, key: EpisodeKey) -> dict[str, Any]:
+    scene = SceneKey(key.task, key.partition, key.scene_set, key.scene)
+    return {
+        "instruction": stage.begin(scene, variation=key.variation, split=key.split),
+        "sizes_m": tuple(round(float(size), 6) for size in np.ravel(stage.env.sizes_m)),
+        "fingerprint": stage.fingerprint(),
+    }
+
+
+def _begin(
+    stage: Stage, policy: Policy | Probe, entry: Entry, key: EpisodeKey, instruction: str
+) -> Memory:
+    if entry.privileged:
+        return cast(Probe, policy).begin_on(stage, episode_rng(entry.agent, key))
+    return cast(Policy, policy).begin(instruction)
+
+
+def _play(
+    stage: Stage, policy: Policy | Probe, memory: Memory, course: _Course, *, privileged: bool
+) -> None:
+    """Keyframe after keyframe, until the first lenient success, a refusal or the limit."""
+    for _ in range(MAX_KEYFRAMES):
+        if privileged:
+            keyframe, memory = cast(Probe, policy).act_on(stage, memory)
+        else:
+            keyframe, memory = _look_and_act(stage, cast(Policy, policy), memory, course)
+        result = stage.execute(keyframe)
+        if result.refusal is not None:
+            course.end, course.reason = INVALID_ACTION, result.refusal
+            return
+        course.keyframes += 1
+        course.success, course.success_lenient = result.success, result.success_lenient
+        if result.success_lenient:
+            course.end = SUCCEEDED
+            return
+
+
+def _look_and_act(
+    stage: Stage, policy: Policy, memory: Memory, course: _Course
+) -> tuple[Keyframe, Memory]:
+    observation = stage.observe()
+    if not course.pixels:
+        course.pixels = hashlib.sha256(observation.rgb.tobytes()).hexdigest()
+        course.renderer = renderer()
+    started = time.perf_counter()
+    (keyframe,), (memory,) = policy.act([observation], [memory])  # official: a batch of one
+    course.inference_s += time.perf_counter() - started
+    return keyframe, memory
+
+
+def _judge(stage: Stage) -> dict[str, Any]:
+    outcome = stage.outcome()
+    return {"outcome": outcome.code, "asked": outcome.asked, "handled": outcome.handled}
+
+
+def _result(course: _Course) -> dict[str, Any]:
+    return {field.name: getattr(course, field.name) for field in fields(course)[:-1]}
+
+
+def _seconds(
+    started: float, before: Mapping[str, float], after: Mapping[str, float], course: _Course
+) -> Seconds:
+    spent = {phase: round(after[phase] - before.get(phase, 0.0), 4) for phase in after}
+    return Seconds(
+        total=round(time.perf_counter() - started, 4),
+        setup=spent.get("scenes", 0.0),
+        planning=spent.get("planning", 0.0),
+        physics=spent.get("physics", 0.0),
+        rendering=spent.get("rendering", 0.0),
+        inference=round(course.inference_s, 4),
+    )

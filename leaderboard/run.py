@@ -1,0 +1,233 @@
+"""Evaluate an agent on the official scenes: `python -m leaderboard.run --agent sacil`.
+
+Every agent meets the same scenes and words. Each episode becomes a line of OUT/episodes.jsonl as
+it ends and OUT/summary.csv is the table. The same command again runs what is missing, and nothing
+if nothing is.
+
+Agents: oracle, hold, random and blind are built in; a file in baselines/agents or
+sacil_agent/agents goes by its name (sacil, rvt, sacil:no_queries), an installed one by its entry
+point (group sacil.agents), and any other as my_package.policy:load.
+"""
+
+import os
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import tyro
+from tqdm import tqdm
+
+from leaderboard import manifest as manifests
+from leaderboard.agents import find_agent
+from leaderboard.entry import Entry
+from leaderboard.plan import SceneJob, plan_episodes, scene_jobs, whole_scenes
+from leaderboard.protocol import EvalProtocol, protocol_of
+from leaderboard.records import EpisodeKey, EpisodeLog, EpisodeRecord, doubts
+from leaderboard.summary import console_table, write_summary
+from leaderboard.worker import Choice, Doorkeeper, Look, Player
+from sacil_tasks.catalog import suite_tasks, task_names
+from sacil_tasks.errors import UsageError, find_name, run_command
+from sacil_tasks.workers import JobFailure, run_jobs
+
+SUMMARY_FILE = "summary.csv"
+VIDEO_FOLDER = "videos"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """What to evaluate, on which scenes, and where to put the results."""
+
+    agent: str
+    """Name of the agent, `name:variant`, or `my_package.policy:load`."""
+
+    suite: str = "slice"
+    """Tasks to run: `slice` (the first three), `single`, `dual` or `all`."""
+
+    tasks: tuple[str, ...] = ()
+    """Tasks by name, e.g. `pick_and_lift push_buttons`; they replace the suite."""
+
+    split: tuple[str, ...] = ("canon",)
+    """Size splits: `canon` as trained, `shift_down` and `shift_up` one rung smaller or larger."""
+
+    partition: Literal["test", "val"] = "test"
+    """`val` is for decisions; `test` is for the one run whose numbers are reported."""
+
+    episodes: int = 25
+    """Episodes per task and split, rounded up to whole scenes (each scene under all its words)."""
+
+    checkpoint: Path | None = None
+    """Folder with trained weights; without it, the agent's released ones."""
+
+    seed: int = 0
+    """Scene set: 0 is the official one, any other an independent draw."""
+
+    workers: int = min(2, os.cpu_count() or 1)
+    """Processes that play episodes; results do not depend on it."""
+
+    out: Path | None = None
+    """Folder of the results; without it, one under runs/eval named after the choices above."""
+
+    video: bool = False
+    """Also film every episode, to OUT/videos (slow)."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A checked configuration: every name is known and every task has every split."""
+
+    choice: Choice
+    keys: tuple[EpisodeKey, ...]
+    protocols: dict[str, EvalProtocol]
+    folder: Path
+
+    @classmethod
+    def of(cls, config: RunConfig) -> "Job":
+        """Check a configuration; starts nothing.
+
+        Raises:
+            UsageError: a name is unknown, a task lacks a split, or a number makes no sense.
+        """
+        if config.workers < 1:
+            raise UsageError(f"--workers must be at least 1, but {config.workers} came.")
+        if config.checkpoint is not None and not config.checkpoint.exists():
+            raise UsageError(f"there is no checkpoint at {config.checkpoint}.")
+        agent = find_agent(config.agent)
+        tasks = tuple(find_name(task, task_names(), "task") for task in config.tasks)
+        tasks = tasks or suite_tasks(config.suite)
+        keys = plan_episodes(tasks, config.split, config.partition, config.seed, config.episodes)
+        protocols = {task: protocol_of(task, config.partition, config.seed) for task in tasks}
+        choice = Choice(agent=agent, checkpoint=config.checkpoint, tasks=tasks)
+        return cls(choice, tuple(keys), protocols, config.out or default_folder(config))
+
+
+def default_folder(config: RunConfig) -> Path:
+    """Where results go without --out; more tasks or episodes join the same folder."""
+    agent = config.agent.replace(":", "-").replace(".", "-")
+    weights = [config.checkpoint.resolve().name] if config.checkpoint else []
+    splits = "+".join(dict.fromkeys(config.split))
+    name = "-".join([agent, *weights, config.partition, splits, f"seed{config.seed}"])
+    return Path("runs", "eval", name)
+
+
+def main(config: RunConfig) -> None:
+    """Run what is missing, write the summary and print the table.
+
+    Raises:
+        UsageError: nothing can be run as asked; what is on disk stays as it was.
+    """
+    job = Job.of(config)
+    _announce(config, job)
+    look = _look(job)
+    entry = Entry(
+        agent=job.choice.agent.name,
+        privileged=look.privileged,
+        checkpoint=look.checkpoint,
+        protocols={task: protocol.hash for task, protocol in job.protocols.items()},
+    )
+    ours = _manifest(config, job, entry)
+    theirs = manifests.read_manifest(job.folder)
+    if theirs is not None:
+        manifests.check_same_run(job.folder, ours, theirs)
+    with EpisodeLog(job.folder) as log:
+        missing = _missing(job, log)
+        if missing:
+            manifests.write_manifest(job.folder, theirs.joined(ours) if theirs else ours)
+            videos = job.folder / VIDEO_FOLDER if config.video else None
+            _run(Player(job.choice, entry, videos), missing, log, config.workers)
+        else:
+            print(f"Nothing to do: all {len(job.keys)} episodes are in {job.folder}.")
+        _report(job, log)
+
+
+def _announce(config: RunConfig, job: Job) -> None:
+    for task in job.choice.tasks:
+        whole = whole_scenes(task, config.episodes)
+        if whole != config.episodes:
+            print(f"{task}: {config.episodes} episodes are rounded up to {whole}, whole scenes.")
+
+
+def _look(job: Job) -> Look:
+    """Load the agent in a child process: its crash is a sentence, and torch stays out of here.
+
+    Raises:
+        UsageError: the agent cannot be loaded.
+    """
+    ((_, look),) = run_jobs([job.choice], Doorkeeper(), workers=1)
+    if isinstance(look, JobFailure):
+        raise UsageError(
+            f"agent '{job.choice.agent.name}' failed while loading ({look.reason}); "
+            f"nothing was run.\n{look.details}".rstrip()
+        )
+    return cast(Look, look)
+
+
+def _manifest(config: RunConfig, job: Job, entry: Entry) -> manifests.Manifest:
+    ours = manifests.Manifest(
+        agent=entry.agent,
+        privileged=entry.privileged,
+        checkpoint=entry.checkpoint,
+        partition=config.partition,
+        scene_set=config.seed,
+        splits=sorted(set(config.split)),
+        protocols={task: protocol.described() for task, protocol in job.protocols.items()},
+        commands=[shlex.join(["python", "-m", "leaderboard.run", *sys.argv[1:]])],
+        versions=manifests.installed_versions(),
+    )
+    return manifests.counted(job.folder, ours)
+
+
+def _missing(job: Job, log: EpisodeLog) -> list[EpisodeKey]:
+    done = {record.key for record in log.records}
+    return [key for key in job.keys if key not in done]
+
+
+def _run(player: Player, missing: Sequence[EpisodeKey], log: EpisodeLog, workers: int) -> None:
+    successes = 0
+    with tqdm(total=len(missing), unit="ep", disable=not sys.stderr.isatty()) as bar:
+        for record in play(player, scene_jobs(missing), workers):
+            log.append(record)
+            successes += record.success
+            bar.set_description(record.task)
+            bar.update()
+            bar.set_postfix_str(f"success {successes}/{bar.n}")
+
+
+def play(player: Player, jobs: Sequence[SceneJob], workers: int) -> Iterator[EpisodeRecord]:
+    """Records as they come. The episode that kills a worker is found and becomes an error.
+
+    Raises:
+        UsageError: no episode can run on this machine.
+    """
+    suspects: list[SceneJob] = []
+    for job, result in run_jobs(jobs, player, workers):
+        if not isinstance(result, JobFailure):
+            yield from result
+        elif result.died and len(job.keys) > 1:
+            suspects += job.singly()
+        else:
+            yield from (player.entry.lost(key, result.reason) for key in job.keys)
+    if suspects:
+        yield from play(player, suspects, workers)
+
+
+def _report(job: Job, log: EpisodeLog) -> None:
+    write_summary(job.folder / SUMMARY_FILE, log.records)
+    wanted = set(job.keys)
+    ours = [record for record in log.records if record.key in wanted]
+    print(console_table(ours))
+    errors = sum(record.errored for record in ours)
+    if errors:
+        example = next(record for record in ours if record.errored)
+        print(f"{errors} episodes broke off and count as failures, e.g. {example.reason}")
+    for warning in doubts(ours):
+        print(f"warning: {warning}")
+    if any(record.privileged for record in ours):
+        print("* reads the simulator's state: a ceiling or a floor, not a contender.")
+    print(f"Written: {job.folder / SUMMARY_FILE} and {log.path.name}")
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(RunConfig, description=__doc__)))
