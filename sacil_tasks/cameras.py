@@ -34,9 +34,9 @@ class FixedCamera:
 
 
 AIMED = {
-    "front": FixedCamera((0.75, 0.0, 0.72), (-0.06, 0.0, 0.09), 36.0),
-    "left_shoulder": FixedCamera((-0.42, 0.62, 0.85), (-0.075, 0.0, 0.06), 38.0),
-    "right_shoulder": FixedCamera((-0.42, -0.62, 0.85), (-0.075, 0.0, 0.06), 38.0),
+    "front": FixedCamera((1.3, 0.0, 1.0), (-0.04, 0.0, 0.255), 24.5),
+    "left_shoulder": FixedCamera((-0.70, 0.95, 1.05), (-0.055, 0.0, 0.135), 28.5),
+    "right_shoulder": FixedCamera((-0.70, -0.95, 1.05), (-0.055, 0.0, 0.135), 28.5),
 }
 """Aimed so that the task region fills each view and the arm at home hides no candidate in more
 than one. D-cameras."""

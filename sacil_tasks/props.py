@@ -126,10 +126,10 @@ def _handle_mesh(diameter_m: float) -> trimesh.Trimesh:
     turn = np.linspace(0, 2 * np.pi, 9)
     profile = np.stack([np.cos(turn), np.sin(turn)], axis=1) * thickness_m
     profile[:, 0] += reach_m - thickness_m
-    ring = trimesh.creation.revolve(profile, angle=np.pi, sections=16)
-    ring.apply_transform(trimesh.transformations.euler_matrix(-np.pi / 2, 0, 0, "rxyz"))
-    ring.apply_transform(trimesh.transformations.euler_matrix(0, np.pi / 2, 0, "sxyz"))
-    ring.apply_translation([diameter_m / 2 * 0.97, 0, 0])
+    ring = trimesh.creation.revolve(profile, angle=np.pi, sections=16)  # y >= 0, about z
+    ring.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    ring.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    ring.apply_translation([0.48 * diameter_m, 0, 0])
     return ring
 
 
@@ -197,11 +197,10 @@ def build_marker(scene: ManiSkillScene, name: str) -> Actor:
 
 
 def build_goal(scene: ManiSkillScene, name: str, radius_m: float) -> Actor:
-    """Translucent sphere in the air that nothing can touch."""
+    """Pale sphere in the air that nothing can touch."""
     builder = scene.create_actor_builder()
     if scene.can_render():
-        material = sapien.render.RenderMaterial(base_color=[0.9, 0.95, 1.0, 0.5])
-        builder.add_sphere_visual(radius=radius_m, material=material)
+        builder.add_sphere_visual(radius=radius_m, material=_matte((0.95, 0.97, 1.0)))
     builder.initial_pose = sapien.Pose([0, 0, 0.25])
     return builder.build_kinematic(name=name)
 

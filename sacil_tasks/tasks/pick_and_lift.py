@@ -42,7 +42,7 @@ class PickAndLiftEnv(SizedTableEnv):
     """
     **Task Description:**
     Three cubes that differ in size only lie on the table. Pick up the one whose size is named and
-    hold it inside the translucent sphere.
+    hold it inside the pale sphere.
 
     **Randomizations:**
     - cube positions are uniform in [-0.22, 0.05] x [-0.28, 0.28], at least 0.13 m apart
