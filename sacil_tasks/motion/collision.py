@@ -5,8 +5,9 @@ the convex hull of its shapes; what stands still keeps every shape, so that the 
 drawer. coal's dynamic tree finds the few pairs worth an exact test.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TypeAlias
 
 import coal
@@ -14,10 +15,10 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Bool, Float64
 from mani_skill.envs.sapien_env import BaseEnv
-from sapien import Entity, physx
 
+from sacil_tasks.motion.bodies import BASE_LINK, RobotShapes, gap_m, read_bodies
 from sacil_tasks.motion.kinematics import ARM_JOINTS, SRDF, Joints, PandaArm, Path
-from sacil_tasks.motion.shapes import Placed, hull, to_coal, to_se3
+from sacil_tasks.motion.shapes import Placed
 
 MARGIN_M = 0.01
 """Free motion keeps this distance; without it the arm was seen to brush handles."""
@@ -34,29 +35,9 @@ OPEN_M = 0.04
 EMPTY_M = 0.002
 """Closed fingers nearer to the middle than this hold nothing."""
 
-SHOULDER_IN_BASE = np.array([0.0, 0.0, 0.333])
-REACH_M = 1.25
-"""No point of the hand or of what it holds is ever farther from the shoulder."""
-
 HAND_JOINT = 7
-BASE_LINK = "panda_link0"
-
-RobotShapes: TypeAlias = Mapping[str, list[Placed]]
-"""Collision geometry by link name; the same for every scene."""
-
 Gaps: TypeAlias = dict[int, float]
 """Distance (m) by collision pair, for the pairs closer than their margin."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """An obstacle: an actor, or a link of an articulation that is not the robot."""
-
-    name: str
-    entity: Entity
-    shapes: tuple[Placed, ...]
-    movable: bool
-    """Free to be picked up."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +72,8 @@ class CollisionWorld:
     """
 
     def __init__(self, arm: PandaArm, robot: RobotShapes, env: BaseEnv) -> None:
-        self.bodies = _read_bodies(env)
+        """Read the scene of `env` as it is built now; its poses come with each state."""
+        self.bodies = read_bodies(env)
         self._arm = arm
         self._model = pin.GeometryModel()
         self._owner: list[int] = []
@@ -110,17 +92,19 @@ class CollisionWorld:
         self._configuration = pin.neutral(arm.model)
 
     def set_state(self, state: MotionState, *, ignore_obstacles: bool = False) -> None:
-        """Place every body and the fingers; with `ignore_obstacles` only the robot's own links count."""
+        """Place every body and the fingers.
+
+        With `ignore_obstacles` only the robot's own links may not meet each other.
+        """
         self._configuration[ARM_JOINTS:] = state.finger_m
         hand = self._hand_in_base(state.joints)
-        for part in self._parts:
+        for part, (_, pose) in self._placed(state):
             geometry = self._model.geometryObjects[part.geometry]
-            pose = state.bodies_in_base[part.body] * part.placed[1]
             held = part.body == state.held
             geometry.parentJoint = HAND_JOINT if held else 0
             geometry.placement = hand.actInv(pose) if held else pose
         active = self._activity(state.held) & (self._robot_only() | (not ignore_obstacles))
-        self._data.setActiveCollisionPairs(self._model, active, True)
+        self._data.setActiveCollisionPairs(self._model, active, upper=True)
         self._set_margins({})
 
     def open_corridor(self, start: Joints, goal: Joints) -> bool:
@@ -134,27 +118,27 @@ class CollisionWorld:
         for pair, gap in near_goal.items():
             if gap < min(0.0, near_start.get(pair, np.inf) - SLACK_M):
                 return False
-        pairs = near_start.keys() | near_goal.keys()
-        self._set_margins(
-            {
-                pair: min(near_start.get(pair, np.inf), near_goal.get(pair, np.inf)) - SLACK_M
-                for pair in pairs
-            }
-        )
+        nearest = {
+            pair: min(near_start.get(pair, np.inf), near_goal.get(pair, np.inf))
+            for pair in near_start.keys() | near_goal.keys()
+        }
+        self._set_margins({pair: gap - SLACK_M for pair, gap in nearest.items()})
         return True
 
     def is_free(self, joints: Joints) -> bool:
         """Whether every pair keeps its distance."""
         return not pin.computeCollisions(
-            self._arm.model, self._arm.data, self._tree, self._with_fingers(joints), True
+            self._arm.model,
+            self._arm.data,
+            self._tree,
+            self._with_fingers(joints),
+            stop_at_first_collision=True,
         )
 
     def is_path_free(self, path: Path) -> bool:
         """Whether every pair keeps its distance everywhere along the joint segments."""
         return all(
-            self.is_free(joints)
-            for start, end in zip(path[:-1], path[1:], strict=True)
-            for joints in _between(start, end)
+            self.is_free(joints) for start, end in pairwise(path) for joints in _between(start, end)
         )
 
     def body_between_fingers(self, state: MotionState) -> int | None:
@@ -164,12 +148,18 @@ class CollisionWorld:
         tcp = self._arm.tcp_in_base(state.joints)
         # A thin bar from finger to finger, along the closing axis y of the tool.
         bar = coal.Box(2e-3, 2 * state.finger_m, 2e-3)
+        center = (coal.Sphere(1e-3), tcp)
         gaps = {
-            part.body: _distance(coal.Sphere(1e-3), tcp, part, state)
-            for part in self._parts
-            if self.bodies[part.body].movable and _distance(bar, tcp, part, state) <= 0
+            part.body: gap_m(center, placed)
+            for part, placed in self._placed(state)
+            if self.bodies[part.body].movable and gap_m((bar, tcp), placed) <= 0
         }
         return min(gaps, key=gaps.__getitem__, default=None)
+
+    def _placed(self, state: MotionState) -> Iterator[tuple[_Part, Placed]]:
+        for part in self._parts:
+            geometry, local = part.placed
+            yield part, (geometry, state.bodies_in_base[part.body] * local)
 
     def _add_robot(self, robot: RobotShapes) -> None:
         model = self._arm.model
@@ -231,16 +221,17 @@ class CollisionWorld:
 
     def _set_margins(self, exceptions: Gaps) -> None:
         margins = np.where(self._robot_only(), 0.0, MARGIN_M)
-        self._data.setSecurityMargins(self._model, margins, True, True)
+        self._data.setSecurityMargins(
+            self._model, margins, upper=True, sync_distance_upper_bound=True
+        )
         for pair, margin in exceptions.items():
             self._data.collisionRequests[pair].security_margin = margin
 
     def _gaps(self, joints: Joints) -> Gaps:
-        configuration = self._with_fingers(joints)
-        model, data = self._model, self._data
-        if not pin.computeCollisions(self._arm.model, self._arm.data, self._tree, configuration):
+        if self.is_free(joints):
             return {}
-        pin.computeCollisions(self._arm.model, self._arm.data, model, data, configuration, False)
+        model, data = self._model, self._data
+        pin.computeCollisions(model, data, stop_at_first_collision=False)
         return {
             pair: pin.computeDistance(model, data, pair).min_distance
             for pair, active in enumerate(data.activeCollisionPairs)
@@ -254,63 +245,6 @@ class CollisionWorld:
     def _with_fingers(self, joints: Joints) -> Float64[np.ndarray, "9"]:
         self._configuration[:ARM_JOINTS] = joints
         return self._configuration
-
-
-def read_robot(env: BaseEnv) -> RobotShapes:
-    """The collision geometry of every robot link."""
-    return {
-        link.name: hull(shapes)
-        for link in env.agent.robot.links
-        if (shapes := link._objs[0].collision_shapes)
-    }
-
-
-def _read_bodies(env: BaseEnv) -> tuple[Body, ...]:
-    world_in_base = to_se3(env.agent.robot.pose.sp).inverse()
-    links = {link._objs[0].entity for link in env.agent.robot.links}
-    bodies = []
-    for entity in env.scene.sub_scenes[0].entities:
-        component = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
-        if component is None or entity in links or not component.collision_shapes:
-            continue
-        movable = (
-            isinstance(component, physx.PhysxRigidDynamicComponent) and not component.kinematic
-        )
-        shapes = component.collision_shapes
-        placed = hull(shapes) if movable else [to_coal(shape) for shape in shapes]
-        pose = world_in_base * to_se3(entity.pose)
-        if movable or min(_shoulder_distance(one, pose) for one in placed) < REACH_M:
-            bodies.append(Body(entity.name, entity, tuple(placed), movable))
-    return tuple(bodies)
-
-
-def _shoulder_distance(placed: Placed, pose: pin.SE3) -> float:
-    shoulder = pin.SE3(np.eye(3), SHOULDER_IN_BASE)
-    return _gap(coal.Sphere(1e-3), shoulder, placed[0], pose * placed[1])
-
-
-def _distance(
-    probe: coal.CollisionGeometry, pose: pin.SE3, part: _Part, state: MotionState
-) -> float:
-    geometry, local = part.placed
-    return _gap(probe, pose, geometry, state.bodies_in_base[part.body] * local)
-
-
-def _gap(
-    one: coal.CollisionGeometry, one_pose: pin.SE3, two: coal.CollisionGeometry, two_pose: pin.SE3
-) -> float:
-    return coal.distance(
-        one,
-        _transform(one_pose),
-        two,
-        _transform(two_pose),
-        coal.DistanceRequest(),
-        coal.DistanceResult(),
-    )
-
-
-def _transform(pose: pin.SE3) -> coal.Transform3s:
-    return coal.Transform3s(pose.rotation, pose.translation)
 
 
 def _between(start: Joints, end: Joints) -> Path:

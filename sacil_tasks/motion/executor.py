@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import gymnasium as gym
 import numpy as np
@@ -9,8 +10,10 @@ import pinocchio as pin
 from jaxtyping import Float64
 from mani_skill.envs.sapien_env import BaseEnv
 
+from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS, Keyframe
-from sacil_tasks.motion.collision import OPEN_M, CollisionWorld, MotionState, read_robot
+from sacil_tasks.motion.bodies import base_in_world, read_robot
+from sacil_tasks.motion.collision import OPEN_M, CollisionWorld, MotionState
 from sacil_tasks.motion.kinematics import ARM_JOINTS, Joints, PandaArm, Path
 from sacil_tasks.motion.planner import Planner, Refusal, timed
 from sacil_tasks.motion.shapes import to_se3
@@ -49,8 +52,18 @@ class KeyframeExecutor:
     """
 
     def __init__(self, env: gym.Env, config: ExecutorConfig | None = None) -> None:
+        """Act through `env` (wrapped or not), which must be single and driven by `pd_joint_pos`.
+
+        Raises:
+            UsageError: several parallel environments, or another controller.
+        """
         self._env = env
-        self._base: BaseEnv = env.unwrapped
+        self._base = cast(BaseEnv, env.unwrapped)
+        if self._base.num_envs != 1 or self._base.control_mode != "pd_joint_pos":
+            raise UsageError(
+                "keyframes are executed in one environment with control_mode='pd_joint_pos', got "
+                f"{self._base.num_envs} with '{self._base.control_mode}'; make the env like that."
+            )
         self._config = config or ExecutorConfig()
         self._arm = PandaArm()
         self._robot = read_robot(self._base)
@@ -120,7 +133,7 @@ class KeyframeExecutor:
         return replace(state, held=held, finger_m=0.0 if held is None else state.finger_m)
 
     def _state(self) -> MotionState:
-        world_in_base = to_se3(self._base.agent.robot.pose.sp).inverse()
+        world_in_base = base_in_world(self._base).inverse()
         state = MotionState(
             joints=self._joints(),
             finger_m=float(self._fingers().mean()),

@@ -77,6 +77,7 @@ class PandaArm:
     """Pinocchio model of the arm with hand; not safe to share between threads."""
 
     def __init__(self, ik: IkConfig | None = None, line: LineConfig | None = None) -> None:
+        """Parse the robot description."""
         self.model = pin.buildModelFromUrdf(URDF)
         self.data = self.model.createData()
         self.lower: Joints = self.model.lowerPositionLimit[:ARM_JOINTS].copy()

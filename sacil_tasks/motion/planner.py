@@ -5,7 +5,10 @@ plan is a function of its arguments alone: limits count iterations, never second
 random stream starts anew with each plan.
 """
 
+import atexit
+import gc
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pinocchio as pin
@@ -17,8 +20,11 @@ from toppra.constraint import JointAccelerationConstraint, JointVelocityConstrai
 from sacil_tasks.motion.collision import CHECK_RAD, CollisionWorld, MotionState
 from sacil_tasks.motion.kinematics import ARM_JOINTS, HALF_TURN, Joints, PandaArm, Path
 
+# Seeding anew for each plan makes OMPL log an error each time; its streams do restart.
 util.setLogLevel(util.LOG_NONE)
 toppra.setup_logging("ERROR")
+# Objects frozen out of garbage collection look like leaks to OMPL's bindings, which say so at exit.
+atexit.register(gc.unfreeze)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +62,16 @@ class TimingConfig:
 class Refusal:
     """Why a keyframe cannot be executed."""
 
-    reason: str
-    """One of not_finite, outside_workspace, no_ik, in_collision, no_path."""
+    reason: Literal["not_finite", "outside_workspace", "no_ik", "in_collision", "no_path"]
 
 
 class Planner:
     """Joint paths in one scene."""
 
-    def __init__(self, arm: PandaArm, world: CollisionWorld, config: PlannerConfig | None = None):
+    def __init__(
+        self, arm: PandaArm, world: CollisionWorld, config: PlannerConfig | None = None
+    ) -> None:
+        """Plan for `arm` within `world`."""
         self._arm = arm
         self._world = world
         self._config = config or PlannerConfig()
