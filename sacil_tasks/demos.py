@@ -36,6 +36,9 @@ REDRAW_STRIDE = 1_000_000
 MAX_FAILURES = 10
 """Scenes tried for one demo before it is given up."""
 
+ENV_KWARGS = {"obs_mode": "none", "control_mode": "pd_joint_pos", "sim_backend": "physx_cpu"}
+"""How the environment is made for a demo and for its replay."""
+
 _PART_SCHEMA = 1
 
 
@@ -188,8 +191,8 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     return records
 
 
-def merge(demos: DemoSet, count: int, env_kwargs: Mapping[str, Any]) -> None:
-    """Join merged demos and parts, `count` in all, and drop the parts.
+def merge(demos: DemoSet, count: int) -> None:
+    """Join merged demos and parts, `count` in all; the parts stay.
 
     Raises:
         UsageError: the folder cannot be written or the disk is full.
@@ -203,7 +206,7 @@ def merge(demos: DemoSet, count: int, env_kwargs: Mapping[str, Any]) -> None:
             "env_info": {
                 "env_id": f"sacil_tasks:{env_id(demos.task)}",
                 "max_episode_steps": MAX_EPISODE_STEPS,
-                "env_kwargs": dict(env_kwargs),
+                "env_kwargs": dict(ENV_KWARGS),
             },
             "source_type": "motionplanning",
             "source_desc": "expert keyframes executed by sacil_tasks.motion",
@@ -213,7 +216,6 @@ def merge(demos: DemoSet, count: int, env_kwargs: Mapping[str, Any]) -> None:
     )
     write_json(demos.folder / "expert.json", expert_summary(records))
     _merge_keyframes(demos, count, merged, demos_sha256=content_hash([arrays, records]))
-    drop_parts(demos)
 
 
 def drop_parts(demos: DemoSet) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from sacil_tasks.cameras import observe
 from sacil_tasks.catalog import env_id, task_spec
+from sacil_tasks.demos import ENV_KWARGS
 from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import Slots, draw_words, variations
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Observation
@@ -24,9 +25,6 @@ from sacil_tasks.outcomes import Outcome
 from sacil_tasks.recording import StepRecorder
 from sacil_tasks.scenes import ATTEMPTS, scene_seed, stream
 from sacil_tasks.table import SizedTableEnv
-
-ENV_KWARGS = {"obs_mode": "none", "control_mode": "pd_joint_pos", "sim_backend": "physx_cpu"}
-"""How the environment is made, here and by whoever replays a demo."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,200 @@
+"""Generate motion-planned demonstrations: `python -m sacil_tasks.gen_demos`.
+
+Demo i shows scene i with variation i mod V. Where the expert fails, the demo is drawn again with
+the same variation in another scene, so that the words stay balanced; every failure is stored.
+Demos do not depend on the number of workers. Killed at any instant, the same command resumes;
+a larger `--demos` extends what is there.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from tqdm import tqdm
+
+from sacil_tasks.catalog import suite_tasks, task_names, task_spec
+from sacil_tasks.demos import (
+    MAX_FAILURES,
+    DemoJob,
+    DemoSet,
+    count_merged,
+    drop_parts,
+    expert_summary,
+    has_part,
+    merge,
+    read_records,
+)
+from sacil_tasks.errors import UsageError, find_name, run_command
+from sacil_tasks.files import atomic_path
+from sacil_tasks.workers import JobFailure, run_jobs
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenConfig:
+    """Generate demonstrations, and from them the keyframes that training reads.
+
+    Killed or stopped, the same command resumes; a larger --demos extends what is there.
+    """
+
+    tasks: tuple[str, ...] = ()
+    """Tasks by name; they override the suite."""
+
+    suite: str = "slice"
+    """A group of tasks: slice, single, dual or all."""
+
+    demos: int = 100
+    """Demos per task."""
+
+    split: str = "canon"
+    """Sizes on the table: canon, shift_down or shift_up."""
+
+    partition: Literal["train", "val"] = "train"
+    """Scenes to draw from; there are no demos of test scenes."""
+
+    seed: int = 0
+    """Scene set; 0 is the official one."""
+
+    out: Path = Path("data")
+    """Folder of all data."""
+
+    workers: int = os.cpu_count() or 1
+    """Processes; the demos are the same for any number."""
+
+
+def main(config: GenConfig) -> None:
+    """Make what is missing, merge it and print how the expert fared.
+
+    Raises:
+        UsageError: a name is unknown, files are in the way, or demos could not be made.
+    """
+    sets = plan(config)
+    jobs = [job for demos in sets for job in missing_jobs(demos, config.demos)]
+    started = time.perf_counter()
+    lost = generate(jobs, config.workers)
+    incomplete = {job.demos for job in lost}
+    for demos in sets:
+        if demos not in incomplete:
+            finish(demos, config.demos)
+    _report([demos for demos in sets if demos not in incomplete])
+    if jobs:
+        seconds = time.perf_counter() - started
+        print(f"{len(jobs)} demos in {seconds:.0f} s: {len(jobs) / seconds:.2f} demos/s")
+    if lost:
+        raise UsageError(
+            f"{len(lost)} demos could not be made in {MAX_FAILURES} scenes each; the first is "
+            f"demo {lost[0].index} of {lost[0].demos.task} ({lost[0].failures[-1].reason}). "
+            "The others are kept and the same command tries again."
+        )
+
+
+def plan(config: GenConfig) -> list[DemoSet]:
+    """Resolve names and folders, before any simulator starts.
+
+    Raises:
+        UsageError: a name or number is wrong, or the output folder cannot be written.
+    """
+    tasks = config.tasks or suite_tasks(config.suite)
+    for task in tasks:
+        find_name(task, task_names(), "task")
+        find_name(config.split, task_spec(task).splits, f"split of {task}")
+    if config.demos < 1 or config.workers < 1:
+        raise UsageError(
+            f"--demos and --workers are at least 1, but {config.demos} and {config.workers} came."
+        )
+    _check_writable(config.out)
+    return [
+        DemoSet(
+            out=config.out,
+            task=task,
+            split=config.split,
+            partition=config.partition,
+            scene_set=config.seed,
+            code_version=_code_version(),
+        )
+        for task in dict.fromkeys(tasks)
+    ]
+
+
+def missing_jobs(demos: DemoSet, count: int) -> list[DemoJob]:
+    """Demos that are neither merged nor waiting as parts."""
+    wanted = range(count_merged(demos), count)
+    return [DemoJob(demos, index) for index in wanted if not has_part(demos, index)]
+
+
+def generate(jobs: Sequence[DemoJob], workers: int) -> list[DemoJob]:
+    """Make the parts of all jobs; return the jobs given up.
+
+    Raises:
+        UsageError: nothing can be made on this machine.
+    """
+    lost: list[DemoJob] = []
+    with tqdm(total=len(jobs), unit="demo", disable=not sys.stderr.isatty()) as bar:
+        while jobs:
+            unfinished = list(_unfinished(jobs, workers, bar))
+            lost += [job for job in unfinished if len(job.failures) == MAX_FAILURES]
+            jobs = [job for job in unfinished if len(job.failures) < MAX_FAILURES]
+    return lost
+
+
+def finish(demos: DemoSet, count: int) -> None:
+    """Merge the parts, unless they have been merged already."""
+    if count_merged(demos) < count:
+        merge(demos, count)
+    drop_parts(demos)
+
+
+def _unfinished(jobs: Sequence[DemoJob], workers: int, bar: tqdm) -> Iterator[DemoJob]:
+    """Run all jobs once; yield those to be run again, as they should be run."""
+    made, failed = 0, 0
+    with closing(run_jobs(jobs, "sacil_tasks.expert:Demonstrator", workers)) as results:
+        for job, result in results:
+            if isinstance(result, JobFailure):
+                bar.write(f"demo {job.index} of {job.demos.task}: {result.reason}", sys.stderr)
+                yield job.after(result)
+            elif len(result) == MAX_FAILURES:
+                yield replace(job, failures=result)
+            else:
+                made, failed = made + 1, failed + len(result)
+                bar.set_postfix_str(f"expert {made}/{made + failed}", refresh=False)
+                bar.update()
+
+
+def _report(sets: Sequence[DemoSet]) -> None:
+    """Print one row a task: how the expert fared, in all and by size, and what it takes on disk."""
+    for demos in sets:
+        expert = expert_summary(read_records(demos.folder))
+        by_size = ", ".join(
+            f"{size} {tally['successes']}/{tally['trials']}"
+            for size, tally in expert["by_size"].items()
+        )
+        print(
+            f"{demos.task:18} {demos.split} {demos.partition}: {expert['successes']} demos, "
+            f"expert {expert['successes']}/{expert['trials']} ({by_size}), "
+            f"scenes accepted {expert['scenes_accepted']}/{expert['scenes_drawn']}, "
+            f"{demos.keyframes.stat().st_size / 1e6:.1f} MB in {demos.keyframes}"
+        )
+
+
+def _check_writable(folder: Path) -> None:
+    probe = folder / ".writable"
+    with atomic_path(probe) as draft:
+        draft.touch()
+    probe.unlink()
+
+
+def _code_version() -> str:
+    try:
+        return version("sacil")
+    except PackageNotFoundError:
+        return "uninstalled"
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(GenConfig)))
