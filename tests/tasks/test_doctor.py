@@ -3,7 +3,7 @@
 import pytest
 
 from sacil_tasks import doctor, vulkan
-from sacil_tasks.doctor import CheckError, Check, DoctorConfig, diagnose, run_in_child
+from sacil_tasks.doctor import Check, CheckError, DoctorConfig, diagnose, run_in_child
 from sacil_tasks.errors import UsageError
 
 
