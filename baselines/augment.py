@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from baselines.rotation import multiply
-from baselines.views import cube_from_base
+from baselines.views import apply_affine, cube_from_base
 from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
 
 
@@ -42,7 +42,7 @@ class Augmentation:
 
     def move_points(self, points_in_base: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
         """Move positions (m)."""
-        return points_in_base @ self.matrix[:, :3].T + self.shift_m
+        return apply_affine(self.matrix, points_in_base)
 
     def move_pose(self, pose_in_base: Float[np.ndarray, "*b 7"]) -> Float[np.ndarray, "*b 7"]:
         """Move poses: position (m), then quaternion wxyz."""

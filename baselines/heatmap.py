@@ -8,6 +8,8 @@ along its own axis, so the score of a cell is A(x, y) + B(x, z) + C(y, z): exact
 grid at the cost of three images.
 """
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -28,13 +30,24 @@ REFINE_CELLS = 2
 def target_heatmaps(
     points_in_cube: Float[torch.Tensor, "b 3"], pixels: int, sigma_px: float = SIGMA_PX
 ) -> Float[torch.Tensor, "b 5 h w"]:
-    """Gaussians about the projections of the labels; each view sums to 1."""
-    centers = torch.arange(pixels, dtype=points_in_cube.dtype, device=points_in_cube.device) + 0.5
-    offsets = project(points_in_cube, pixels)[..., None] - centers
-    along_u, along_v = torch.exp(offsets.square() / (-2 * sigma_px**2)).unbind(dim=2)
-    maps = along_v[..., :, None] * along_u[..., None, :]
-    maps = maps * (maps >= np.exp(-(CUTOFF_SIGMAS**2) / 2))
-    return maps / maps.sum(dim=(-2, -1), keepdim=True)
+    """Gaussians about the projections of the labels; each view sums to 1.
+
+    Only the small window that is not zero is computed. Labels must lie in the cube.
+    """
+    reach = math.ceil(CUTOFF_SIGMAS * sigma_px)
+    uv = project(points_in_cube, pixels)[..., None]
+    window = uv.floor() + torch.arange(-reach, reach + 1, device=uv.device)
+    heights = torch.exp((window + 0.5 - uv).square() / (-2 * sigma_px**2))
+    heights = heights * ((window >= 0) & (window < pixels))
+    along_u, along_v = heights.unbind(dim=2)
+    patches = along_v[..., :, None] * along_u[..., None, :]
+    patches = patches * (patches >= math.exp(-(CUTOFF_SIGMAS**2) / 2))
+    patches = patches / patches.sum(dim=(-2, -1), keepdim=True)
+    columns, rows = window.clamp(0, pixels - 1).long().unbind(dim=2)
+    where = rows[..., :, None] * pixels + columns[..., None, :]
+    maps = patches.new_zeros(*uv.shape[:2], pixels * pixels)
+    maps.scatter_add_(-1, where.flatten(-2), patches.flatten(-2))
+    return maps.unflatten(-1, (pixels, pixels))
 
 
 @torch.no_grad()

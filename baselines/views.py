@@ -31,8 +31,11 @@ CHANNELS = ("x", "y", "z", "red", "green", "blue", "depth")
 """Position in the cube frame, colour in [0, 1], depth less its mean over the view's points."""
 
 U_AXIS, U_SIGN = (0, 0, 0, 1, 1), (1, -1, 1, 1, -1)
-V_AXIS = (1, 2, 2, 2, 2)  # v always points against its axis
+V_AXIS = (1, 2, 2, 2, 2)
+"""Cube axes of image columns and rows; v always points against its axis."""
+
 DEPTH_AXIS, CAMERA_SIDE = (2, 1, 1, 0, 0), (1, 1, -1, 1, -1)
+"""Axis a view looks along and the side it looks from; views of one axis stand together."""
 
 EMPTY_DEPTH = -1.0
 """Depth where no point is seen; the other channels are 0 there."""
@@ -40,7 +43,6 @@ EMPTY_DEPTH = -1.0
 INDEX_BITS = 27
 DEPTH_STEPS = 2.0**24  # 1 - c is a multiple of 2^-24 for each float32 c in [-1, 1]
 NOTHING = np.int64(2**62)
-PLUS, MINUS = np.float32(1), np.float32(-1)  # the side a camera looks from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +58,13 @@ def cube_from_base(bounds: SceneBounds = SCENE_BOUNDS) -> Float32[np.ndarray, "3
     scale = 2.0 / bounds.side_m
     shift = -scale * np.asarray(bounds.center_in_base)
     return np.column_stack([scale * np.eye(3), shift]).astype(np.float32)
+
+
+def apply_affine(
+    transform: Float[np.ndarray, "3 4"], points: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "*b 3"]:
+    """Map points (not directions) through a 3 x 4 matrix."""
+    return points @ transform[:, :3].T + transform[:, 3]
 
 
 def base_from_cube(
@@ -93,9 +102,13 @@ def render_views(
         pixels: side of each view.
         out: memory to draw into (a slice of a batch saves allocating it anew).
     """
+    shape = (len(VIEWS), len(CHANNELS), pixels, pixels)
     if out is None:
-        out = np.empty((len(VIEWS), len(CHANNELS), pixels, pixels), np.float32)
-    _render(xyz, rgb, transform, out)
+        out = np.empty(shape, np.float32)
+    if out.shape != shape or xyz.shape != rgb.shape:
+        shapes = f"{xyz.shape}, {rgb.shape} into {out.shape}"
+        raise ValueError(f"expected points (n, 3), colours (n, 3) into {shape}, came {shapes}")
+    _render(np.asarray(xyz, np.float32), rgb, np.asarray(transform, np.float32), out)
     return out
 
 
@@ -107,14 +120,17 @@ def _render(xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, out: np.nda
     count = _place(xyz, rgb, transform, pixels, points, cells)
     points, cells = points[:count], cells[:count]
     nearest = np.empty((2, pixels + 2, pixels + 2), np.int64)
-    _splat(points, cells, 0, 1, 2, nearest)
-    _paint(points, nearest[0], 2, PLUS, 1, out[0])
-    _splat(points, cells, 0, 2, 1, nearest)
-    _paint(points, nearest[0], 1, PLUS, -1, out[1])
-    _paint(points, nearest[1], 1, MINUS, 1, out[2])
-    _splat(points, cells, 1, 2, 0, nearest)
-    _paint(points, nearest[0], 0, PLUS, 1, out[3])
-    _paint(points, nearest[1], 0, MINUS, -1, out[4])
+    for k in range(len(U_AXIS)):
+        if k == 0 or DEPTH_AXIS[k] != DEPTH_AXIS[k - 1]:
+            _splat(points, cells, U_AXIS[k], V_AXIS[k], DEPTH_AXIS[k], nearest)
+        _paint(
+            points,
+            nearest[int(CAMERA_SIDE[k] < 0)],
+            DEPTH_AXIS[k],
+            CAMERA_SIDE[k],
+            U_SIGN[k],
+            out[k],
+        )
 
 
 @compiled
@@ -179,7 +195,7 @@ def _paint(
     points: np.ndarray,
     nearest: np.ndarray,
     depth_axis: int,
-    side: np.float32,
+    side: int,
     u_sign: int,
     view: np.ndarray,
 ) -> None:
@@ -196,7 +212,7 @@ def _paint(
             i = entry & ((1 << INDEX_BITS) - 1)
             for c in range(6):
                 view[c, v, u] = points[i, c]
-            depth = np.float32(1) - side * points[i, depth_axis]
+            depth = np.float32(1) - np.float32(side) * points[i, depth_axis]
             view[6, v, u] = depth
             total += depth
             covered += 1

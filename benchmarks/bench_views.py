@@ -1,0 +1,190 @@
+"""Time the geometry kit on one core: `python benchmarks/bench_views.py`.
+
+One cloud comes from four synthetic depth cameras around a table with boxes, so that points are
+ordered and overlap as in real observations; the other is the worst case. Views and decoding are
+checked against plain torch versions of the same result, which are also timed.
+"""
+
+import functools
+import os
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+
+from baselines import augment, cloud, heatmap, views
+from sacil_tasks.interface import SCENE_BOUNDS
+
+POINTS = 53_000
+BOXES = (  # centre x, y and half sizes x, y, height (m)
+    (0.45, -0.15, 0.02, 0.02, 0.04),
+    (0.55, 0.05, 0.03, 0.03, 0.06),
+    (0.60, 0.20, 0.04, 0.04, 0.08),
+    (0.75, -0.05, 0.08, 0.15, 0.36),
+)
+EYES = ((1.2, 0.0, 0.7), (0.2, 0.6, 0.7), (0.2, -0.6, 0.7), (0.45, 0.0, 0.5))
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> Float32[np.ndarray, "4 4"]:
+    """Pose of a camera (x right, y down, z forward) that looks at a point."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.1, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3] = np.column_stack([right, np.cross(forward, right), forward, eye])
+    return pose
+
+
+def ray_depth_mm(pose: Float32[np.ndarray, "4 4"], pixels: int, focal: float) -> np.ndarray:
+    """Depth image (mm) of the table and its boxes; 0 where a ray leaves the scene."""
+    v, u = (np.mgrid[:pixels, :pixels] + 0.5 - pixels / 2) / focal
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ pose[:3, :3].T.astype(np.float64)
+    eye = pose[:3, 3].astype(np.float64)
+    boxes = [((x - a, y - b, 0.0), (x + a, y + b, h)) for x, y, a, b, h in BOXES]
+    boxes.append(((0.0, -0.5, -0.1), (0.95, 0.5, 0.0)))  # the table
+    depth = np.full(u.shape, np.inf)
+    for low, high in boxes:
+        first, second = (np.array(low) - eye) / rays, (np.array(high) - eye) / rays
+        enter = np.minimum(first, second).max(axis=-1)
+        leave = np.maximum(first, second).min(axis=-1)
+        depth = np.where((enter < leave) & (enter > 0), np.minimum(depth, enter), depth)
+    return np.where(np.isfinite(depth), 1000 * depth, 0).astype(np.uint16)
+
+
+def observe(pixels: int = 128, focal: float = 150.0) -> tuple[np.ndarray, ...]:
+    """Colours, depth, intrinsics and poses of the four cameras."""
+    target = np.array((0.55, 0.0, 0.1))
+    poses = np.stack([look_at(np.array(eye), target) for eye in EYES])
+    depth_mm = np.stack([ray_depth_mm(pose, pixels, focal) for pose in poses])
+    half = pixels / 2
+    pinhole = np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]], np.float32)
+    rgb = np.random.default_rng(0).integers(0, 256, (*depth_mm.shape, 3), dtype=np.uint8)
+    return rgb, depth_mm, np.stack([pinhole] * len(poses)), poses
+
+
+def torch_views(
+    xyz: Float32[np.ndarray, "n 3"], rgb: np.ndarray, transform: np.ndarray, pixels: int
+) -> Float[torch.Tensor, "5 7 h w"]:
+    """The same picture in torch: (depth, index) packed in one integer, scattered by minimum."""
+    x, y, z = torch.from_numpy(xyz).unbind(-1)
+    rows = torch.from_numpy(transform)
+    placed = torch.stack([r[0] * x + r[1] * y + r[2] * z + r[3] for r in rows], dim=-1)
+    kept = (placed.abs() <= 1).all(dim=-1)
+    placed = placed[kept]
+    features = torch.cat([placed, torch.from_numpy(rgb)[kept] / 255], dim=-1)
+    cells = (pixels / 2 * (1 + placed) + 0.5).long()
+    return torch.stack([_torch_view(features, cells, k, pixels) for k in range(5)])
+
+
+def _torch_view(
+    features: Float[torch.Tensor, "n 6"], cells: Int64[torch.Tensor, "n 3"], k: int, pixels: int
+) -> Float[torch.Tensor, "7 h w"]:
+    depth = 1 - views.CAMERA_SIDE[k] * features[:, views.DEPTH_AXIS[k]]
+    keys = (depth.double() * 2**24).long() << 32 | torch.arange(len(depth))
+    side = pixels + 2
+    first = cells[:, views.V_AXIS[k]] * side + cells[:, views.U_AXIS[k]]
+    nearest = torch.full((side * side,), 2**62)
+    for step in (0, 1, side, side + 1):
+        nearest.scatter_reduce_(0, first + step, keys, "amin")
+    nearest = nearest.view(side, side)[1:-1, 1:-1].flip(0)
+    nearest = nearest if views.U_SIGN[k] > 0 else nearest.flip(1)
+    seen: Bool[torch.Tensor, "h w"] = nearest < 2**62
+    winner = torch.where(seen, nearest & (2**32 - 1), 0)
+    seen_depth = depth[winner]
+    relative = seen_depth - seen_depth[seen].double().mean().float()
+    colours = features[winner].permute(2, 0, 1) * seen
+    return torch.cat([colours, torch.where(seen, relative, views.EMPTY_DEPTH)[None]])
+
+
+def torch_best_cell(logits: Float[torch.Tensor, "1 5 h w"]) -> int:
+    """Arg-max over the whole grid with every score in memory."""
+    xy, xz, yz = (plane[0] for plane in heatmap.score_planes(logits))
+    return int((xy[:, :, None] + xz[:, None, :] + yz[None, :, :]).argmax())
+
+
+def median_ms(call: Callable[[], object], rounds: int = 41) -> float:
+    """Median processor time of one call in milliseconds, after two warm-up calls.
+
+    Everything here runs on one thread, so this is the wall time of an idle core.
+    """
+    times = []
+    for _ in range(rounds + 2):
+        start = time.thread_time()
+        call()
+        times.append(1000 * (time.thread_time() - start))
+    return statistics.median(times[2:])
+
+
+def report(label: str, fast: Callable[[], object], slow: Callable[[], object] | None) -> None:
+    """Print one row: time, and how many times longer the torch version takes."""
+    took = median_ms(fast)
+    ratio = "" if slow is None else f"{median_ms(slow, rounds=7) / took:8.1f}x"
+    print(f"  {label:38}{took:9.3f}{ratio}", flush=True)
+
+
+def time_views(label: str, xyz: np.ndarray, rgb: np.ndarray, pixels: int) -> None:
+    """Check and time the five views of one cloud under one augmentation."""
+    transform = draw_matrix(np.random.default_rng(0))
+    out = np.empty((5, 7, pixels, pixels), np.float32)
+    views.render_views(xyz, rgb, transform, pixels, out)
+    different = int((torch.from_numpy(out) != torch_views(xyz, rgb, transform, pixels)).sum())
+    covered = np.mean(out[:, 6] != views.EMPTY_DEPTH)
+    print(
+        f"{label}: {len(xyz)} points, {covered:.0%} covered, {different} values differ from torch"
+    )
+    report(
+        f"5 views of {pixels} px",
+        lambda: views.render_views(xyz, rgb, transform, pixels, out),
+        lambda: torch_views(xyz, rgb, transform, pixels),
+    )
+
+
+def time_heatmaps(pixels: int) -> None:
+    """Time targets and decoding; the best cell is compared with the whole grid in memory."""
+    points = 2 * torch.rand(16, 3) - 1
+    report(
+        f"16 target heatmaps, {pixels} px", lambda: heatmap.target_heatmaps(points, pixels), None
+    )
+    peaked = (heatmap.target_heatmaps(points[:1], pixels) + 1e-6).log()
+    noise = torch.randn(1, 5, pixels, pixels)
+    for label, logits in (("peaked", peaked), ("noise", noise)):
+        # sharpened so that the mean about the best cell is that cell
+        best = ((heatmap.decode(1000 * logits)[0] + 1) * pixels / 2 - 0.5).round().long()
+        cell = np.unravel_index(torch_best_cell(1000 * logits), (pixels,) * 3)
+        assert best.tolist() == list(cell), "decoding differs from the whole grid"
+        report(
+            f"decode one sample, {pixels} px, {label}",
+            functools.partial(heatmap.decode, logits),
+            functools.partial(torch_best_cell, logits),
+        )
+
+
+def draw_matrix(rng: np.random.Generator) -> np.ndarray:
+    """One augmentation as the renderer takes it."""
+    return augment.draw(rng, np.array([0.55, 0.05, 0.05]), augment.AugmentConfig()).to_cube()
+
+
+def main() -> None:
+    """Time and check everything once."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    torch.set_num_threads(1)
+    print(f"  {'one core':38}ms (median)   torch")
+    sensors, rng = observe(), np.random.default_rng(0)
+    scene = cloud.unproject(*sensors)
+    report("cloud from 4 images of 128 x 128 px", lambda: cloud.unproject(*sensors), None)
+    report("draw an augmentation", lambda: draw_matrix(rng), None)
+    center, half = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2
+    uniform = (center + rng.uniform(-half, half, (POINTS, 3))).astype(np.float32)
+    colours = rng.integers(0, 256, uniform.shape, dtype=np.uint8)
+    for pixels in (128, 220):
+        time_views("table and boxes", scene.xyz_in_base[:POINTS], scene.rgb[:POINTS], pixels)
+        time_views("uniform in the cube, no order", uniform, colours, pixels)
+    for pixels in (128, 220):
+        time_heatmaps(pixels)
+
+
+if __name__ == "__main__":
+    main()
