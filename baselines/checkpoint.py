@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from baselines.agent import Network, agent_modules, find_agent
 from baselines.configs import restore
@@ -126,8 +126,9 @@ def sha256(folder: Path) -> str:
 
 def save_weights(folder: Path, weights: TensorTable) -> None:
     """Write `model.safetensors`."""
+    content = save({name: tensor.contiguous() for name, tensor in weights.items()})
     with atomic_path(folder / MODEL) as draft:
-        save_file({name: tensor.contiguous() for name, tensor in weights.items()}, draft)
+        draft.write_bytes(content)
 
 
 def fill(network: Network, weights: TensorTable, source: Path) -> None:
@@ -161,7 +162,7 @@ class TrainState:
         progress = {"step": self.step, "wall_s": self.wall_s, "cpu_s": self.cpu_s}
         metadata = {"progress": json.dumps(progress), "plan": json.dumps(self.plan)}
         with atomic_path(folder / STATE) as draft:
-            save_file(self.tensors, draft, metadata)
+            draft.write_bytes(save(self.tensors, metadata))
 
     @classmethod
     def load(cls, folder: Path) -> "TrainState | None":

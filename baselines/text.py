@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Int64
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import atomic_path, content_hash, file_sha256
@@ -216,7 +216,7 @@ class SentenceTable:
         tokens, offsets = _pack([self[text] for text in texts])
         metadata = {"spec": json.dumps(asdict(self.spec)), "sentences": json.dumps(texts)}
         with atomic_path(path) as draft:
-            save_file({"tokens": tokens, "offsets": offsets}, draft, metadata)
+            draft.write_bytes(save({"tokens": tokens, "offsets": offsets}, metadata))
 
     @classmethod
     def load(cls, path: Path) -> "SentenceTable":

@@ -1,0 +1,102 @@
+"""What a run is made from: data, embeddings of its sentences, and a network of the right shape."""
+
+import logging
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from baselines.agent import find_agent
+from baselines.checkpoint import Identity
+from baselines.loader import Loader
+from baselines.options import Job
+from baselines.samples import KeyframeSet
+from baselines.text import SentenceTable, cached_table
+from baselines.trainer import Trainer, Validator
+from baselines.validate import validate
+from sacil_tasks.catalog import task_names, task_spec
+
+SPLIT = "canon"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a run is made from: the job, its data and the embeddings of its sentences."""
+
+    job: Job
+    identity: Identity
+    keyframes: KeyframeSet
+    text: SentenceTable
+
+    @classmethod
+    def load(cls, job: Job) -> "Material":
+        """Read the keyframe files.
+
+        Raises:
+            UsageError: files are missing or damaged, or the text encoder is needed but missing.
+        """
+        options = job.options
+        keyframes = KeyframeSet.load(_keyframes(options.data, "train"), options.chosen_tasks)
+        text = cached_table(job.config.recipe.text, sentences_of(keyframes))
+        spec, variant = find_agent(options.agent)
+        identity = Identity(
+            agent=spec.name,
+            variant=variant,
+            preset=options.preset,
+            tasks=keyframes.tasks,
+            text=text.spec,
+            config=job.config,
+        )
+        return cls(job, identity, keyframes, text)
+
+    def trainer(self, steps: int) -> Trainer:
+        """A trainer at step 0; the same every time."""
+        seed = self.job.options.seed
+        torch.manual_seed(seed)
+        network = self.identity.create()
+        loader = Loader(
+            self.keyframes,
+            self.text,
+            pixels=self.job.config.pixels,
+            recipe=self.job.config.recipe,
+            seed=seed,
+            goals=network.needs_goals,
+        )
+        return Trainer(network, loader, self.job.config.recipe, steps=steps, seed=seed)
+
+    def validator(self) -> Validator | None:
+        """Scores on the `val` demos of these tasks, or None where there are none."""
+        folder = _keyframes(self.job.options.data, "val")
+        tasks = [task for task in self.keyframes.tasks if (folder / f"{task}.h5").is_file()]
+        if not tasks:
+            log.info("no validation: no keyframes in %s", folder)
+            return None
+        held_out = KeyframeSet.load(folder, tasks)
+        config = self.job.config
+        loader = Loader(
+            held_out,
+            cached_table(config.recipe.text, sentences_of(held_out)),
+            pixels=config.pixels,
+            recipe=config.recipe,
+            seed=0,
+            goals=False,
+        )
+        return partial(validate, loader=loader)
+
+
+def _keyframes(data: Path, partition: str) -> Path:
+    return data / SPLIT / partition / "keyframes"
+
+
+def sentences_of(keyframes: KeyframeSet) -> dict[Path, set[str]]:
+    """The sentences of each keyframe file, and all official ones of its task."""
+    sentences = {}
+    for shard in keyframes.shards:
+        said = {episode.instruction for episode in shard.episodes}
+        if shard.task in task_names():
+            said.update(officialsentences_of(task_spec(shard.task)))
+        sentences[shard.path] = said
+    return sentences

@@ -1,0 +1,191 @@
+"""Train an agent on keyframe files: `python -m baselines.train --agent rvt`.
+
+`options.py` reads the command line, `material.py` the data, `trainer.py` takes the steps; here a
+run is begun, or found in its folder and completed.
+"""
+
+import importlib.metadata
+import json
+import logging
+import statistics
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from baselines.checkpoint import METRICS, PROVENANCE, TEXT, TrainState
+from baselines.material import Material, sentences_of
+from baselines.options import Job, parse, with_samples
+from baselines.trainer import Run, read_rows
+from sacil_tasks.errors import UsageError, run_command
+from sacil_tasks.files import write_json
+
+CALIBRATION_STEPS = 8
+"""Steps that are timed for `--minutes`; the first two, which compile, are left out."""
+
+
+def main(job: Job) -> None:
+    """Train, or complete, the run that `job` describes.
+
+    Raises:
+        UsageError: whatever a user can set right.
+    """
+    options = job.options
+    torch.set_num_threads(options.threads)
+    state = TrainState.load(options.folder)
+    if state is not None:
+        _check_resumable(job, state)
+        if state.step == state.plan["steps"]:
+            print(f"nothing to do: {options.folder} is complete ({state.step} steps).")
+            return
+    material = Material.load(job)
+    run = _begin(material) if state is None else _continue(material, state)
+    run.finish(validate_every=options.validate_every)
+    _write_provenance(run)
+    _report(options.folder)
+
+
+def _begin(material: Material) -> Run:
+    """Fix the number of steps and write what does not change during the run."""
+    job, folder = material.job, material.job.options.folder
+    steps = _steps(material)
+    job = Job(job.options, with_samples(job.config, steps * job.config.recipe.batch))
+    material = replace(material, job=job, identity=replace(material.identity, config=job.config))
+    material.identity.save(folder)
+    sentences = set().union(*sentences_of(material.keyframes).values())
+    material.text.save(folder / TEXT, sentences)
+    data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
+    plan = {"steps": steps, "request": _request(job), "keyframes": data}
+    run = Run(material.trainer(steps), folder, plan, validate=material.validator())
+    _write_provenance(run)
+    run.save()
+    return run
+
+
+def _continue(material: Material, state: TrainState) -> Run:
+    """Take up a run where it was saved."""
+    found = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
+    for task, sha256 in state.plan["keyframes"].items():
+        if found[task] != sha256:
+            raise UsageError(
+                f"the keyframes of {task} in {material.job.options.data} are not those the run "
+                "began with. Give their folder with --data, or choose another --out."
+            )
+    trainer = material.trainer(state.plan["steps"])
+    folder = material.job.options.folder
+    run = Run(trainer, folder, state.plan, validate=material.validator())
+    run.resume(state)
+    return run
+
+
+def _check_resumable(job: Job, state: TrainState) -> None:
+    options, steps = job.options, state.plan["steps"]
+    if not options.resume and state.step < steps:
+        raise UsageError(
+            f"{options.folder} holds a run that stopped at step {state.step} of {steps}. "
+            "Add --resume to complete it, or choose another --out."
+        )
+    asked = options.steps or (options.samples or 0) // job.config.recipe.batch or steps
+    if asked != steps:
+        raise UsageError(
+            f"{options.folder} holds a run of {steps} steps, but {asked} are asked for. "
+            "Leave the budget out to complete it, or choose another --out."
+        )
+    before, now = _flat(state.plan["request"]), _flat(_request(job))
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            raise UsageError(
+                f"{options.folder} holds a run with {name} {before.get(name)}, but "
+                f"{now.get(name)} is asked for. Repeat its flags, or choose another --out."
+            )
+
+
+def _request(job: Job) -> dict[str, Any]:
+    """What a run is, apart from its budget: a resumed one must agree."""
+    options = job.options
+    config = asdict(job.config)
+    del config["recipe"]["samples"]
+    request = {"agent": options.agent, "preset": options.preset, "seed": options.seed}
+    tasks = list(options.chosen_tasks)
+    return json.loads(json.dumps({**request, "tasks": tasks, "config": config}))
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(tree, dict):
+        return {prefix: tree}
+    return {k: v for name in tree for k, v in _flat(tree[name], f"{prefix}.{name}").items()}
+
+
+def _steps(material: Material) -> int:
+    """The budget in steps."""
+    options, recipe = material.job.options, material.job.config.recipe
+    if options.minutes is None:
+        return options.steps or recipe.samples // recipe.batch
+    trainer = material.trainer(sys.maxsize)
+    seconds = []
+    for _ in range(CALIBRATION_STEPS):
+        start = time.perf_counter()
+        trainer.advance()
+        seconds.append(time.perf_counter() - start)
+    pace = statistics.median(seconds[2:])
+    steps = max(1, round(60 * options.minutes / pace))
+    print(f"{pace:.2f} s a step: {options.minutes:g} minutes are {steps} steps.")
+    return steps
+
+
+def _write_provenance(run: Run) -> None:
+    trainer, request = run.trainer, run.plan["request"]
+    config = request["config"]
+    provenance = {
+        "agent": request["agent"],
+        "preset": request["preset"],
+        "seed": request["seed"],
+        "text": config["recipe"]["text"],
+        "steps": trainer.step,
+        "samples": trainer.step * trainer.recipe.batch,
+        "complete": trainer.step == trainer.steps,
+        "wall_minutes": round(run.wall_s / 60, 2),
+        "core_minutes": round(run.cpu_s / 60, 2),
+        "keyframes_sha256": run.plan["keyframes"],
+        "code_version": _code_version(),
+        "torch": torch.__version__,
+    }
+    write_json(run.folder / PROVENANCE, provenance)
+
+
+def _code_version() -> str:
+    try:
+        return importlib.metadata.version("sacil")
+    except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
+        return "unknown"
+
+
+def _report(folder: Path) -> None:
+    """Print what the run came to."""
+    rows = read_rows(folder / METRICS)
+    last = {row["kind"]: row for row in rows}
+    for name, scores in last.get("val", {}).items():
+        if isinstance(scores, dict):
+            print(_score_line(name, scores))
+    train = last["train"]
+    pace = statistics.median(row["samples_per_s"] for row in rows if row["kind"] == "train")
+    print(f"loss {train['loss']:.3f} after {train['step']} steps, {pace:.1f} samples/s: {folder}")
+
+
+def _score_line(name: str, scores: dict[str, Any]) -> str:
+    total = scores["keyframes"]
+    first, later = (scores[f"selected_{when}"] for when in ("first", "later"))
+    return (
+        f"{name:<32} position {scores['position_mm']:6.1f} mm  "
+        f"rotation {scores['rotation_within_5deg'] / total:4.0%}  "
+        f"gripper {scores['gripper_right'] / total:4.0%}  "
+        f"selected {first[0]}/{first[1]} first, {later[0]}/{later[1]} later"
+    )
+
+
+if __name__ == "__main__":
+    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    run_command(lambda: main(parse(sys.argv[1:])))

@@ -1,0 +1,110 @@
+"""How good are a network's keyframes on held-out demos? Needs no simulator.
+
+Every keyframe is predicted from the demo's own observation (teacher forcing). Counts are
+reported beside their totals, so rows of several runs can be added up.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from baselines.agent import Network
+from baselines.loader import Loader
+from baselines.rotation import multiply
+from baselines.samples import Sample, Shard
+from baselines.views import base_from_cube
+
+REACH_M = 0.06
+"""A keyframe this close to a candidate, seen from above, is meant for it."""
+
+ROTATION_DEG = 5.0
+"""A rotation is right within one bin."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """One predicted keyframe against the demo's."""
+
+    group: tuple[str, str]
+    """Task, and the size words of its instruction."""
+
+    first: bool
+    position_mm: float
+    rotation_deg: float
+    gripper_right: bool
+    selected: bool | None
+    """Whether the candidate reached for is the right one; None where none is meant."""
+
+
+def validate(network: Network, loader: Loader, *, batch: int = 16) -> dict[str, Any]:
+    """Scores of `network` (in eval mode) over all keyframes of `loader`, by task and size."""
+    samples = loader.keyframes.everything()
+    groups = defaultdict(list)
+    for start in range(0, len(samples), batch):
+        for score in _score_batch(network, loader, samples[start : start + batch]):
+            for name in ("all", score.group[0], "/".join(score.group)):
+                groups[name].append(score)
+    return {name: summary(groups[name]) for name in sorted(groups)}
+
+
+def summary(scores: Sequence[Score]) -> dict[str, Any]:
+    """Medians and counts of some scores."""
+    meant = [score for score in scores if score.selected is not None]
+    return {
+        "keyframes": len(scores),
+        "position_mm": round(float(np.median([s.position_mm for s in scores])), 2),
+        "rotation_within_5deg": sum(s.rotation_deg <= ROTATION_DEG for s in scores),
+        "gripper_right": sum(s.gripper_right for s in scores),
+        "selected_first": _tally([s for s in meant if s.first]),
+        "selected_later": _tally([s for s in meant if not s.first]),
+    }
+
+
+def _tally(scores: Sequence[Score]) -> tuple[int, int]:
+    """Right selections, of how many."""
+    return sum(bool(score.selected) for score in scores), len(scores)
+
+
+@torch.no_grad()
+def _score_batch(network: Network, loader: Loader, samples: list[Sample]) -> Iterator[Score]:
+    batch = loader.plain(samples)
+    chosen = network.act(batch.inputs)
+    right = chosen.gripper_open.long() == batch.labels.gripper_open
+    for i, sample in enumerate(samples):
+        shard = loader.keyframes.shards[sample.shard]
+        asked = shard.columns["keyframe_in_base"][sample.row]
+        reached = base_from_cube(chosen.position_in_cube[i]).numpy()
+        words = shard.episodes[loader.keyframes.episode(sample)].slots.values()
+        yield Score(
+            group=(shard.task, "+".join(words)),
+            first=bool(batch.first[i]),
+            position_mm=1000 * float(np.linalg.norm(reached - asked[:3])),
+            rotation_deg=grip_angle_deg(chosen.quaternion_wxyz[i].numpy(), asked[3:]),
+            gripper_right=bool(right[i]),
+            selected=_selected(shard, sample.row, reached),
+        )
+
+
+def _selected(shard: Shard, row: int, reached: Float[np.ndarray, "3"]) -> bool | None:
+    candidates, target = shard.columns["candidate_in_base"][row], shard.columns["target_index"][row]
+    if target < 0 or nearest(candidates, shard.columns["keyframe_in_base"][row, :3]) != target:
+        return None
+    return nearest(candidates, reached) == target
+
+
+def nearest(candidates: Float[np.ndarray, "k 3"], position: Float[np.ndarray, "3"]) -> int | None:
+    """The candidate within `REACH_M` of `position` seen from above, or None."""
+    distances = np.linalg.norm(candidates[:, :2] - position[:2], axis=-1)
+    return int(distances.argmin()) if distances.min() <= REACH_M else None
+
+
+def grip_angle_deg(first: Float[np.ndarray, "4"], second: Float[np.ndarray, "4"]) -> float:
+    """Angle between two grasps: q and -q are one, and so are the twins half a turn apart."""
+    twin = multiply(first, np.array([0.0, 0.0, 0.0, 1.0]))
+    cosine = max(abs(first @ second), abs(twin @ second))
+    return float(np.degrees(2 * np.arccos(min(cosine, 1.0))))
