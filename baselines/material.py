@@ -16,6 +16,7 @@ from baselines.text import SentenceTable, cached_table
 from baselines.trainer import Trainer, Validator
 from baselines.validate import validate
 from sacil_tasks.catalog import task_names, task_spec
+from sacil_tasks.instructions import official_sentences
 
 SPLIT = "canon"
 
@@ -97,6 +98,6 @@ def sentences_of(keyframes: KeyframeSet) -> dict[Path, set[str]]:
     for shard in keyframes.shards:
         said = {episode.instruction for episode in shard.episodes}
         if shard.task in task_names():
-            said.update(officialsentences_of(task_spec(shard.task)))
+            said.update(official_sentences(task_spec(shard.task)))
         sentences[shard.path] = said
     return sentences
