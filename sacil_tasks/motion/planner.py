@@ -8,6 +8,7 @@ random stream starts anew with each plan.
 import atexit
 import gc
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,11 @@ import pinocchio as pin
 import toppra
 from ompl import base, geometric, util
 from toppra.algorithm import TOPPRA
-from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
+from toppra.constraint import (
+    Constraint,
+    JointAccelerationConstraint,
+    JointVelocityConstraint,
+)
 
 from sacil_tasks.motion.collision import CHECK_RAD, CollisionWorld, MotionState
 from sacil_tasks.motion.kinematics import ARM_JOINTS, HALF_TURN, Joints, PandaArm, Path
@@ -190,15 +195,19 @@ def timed(path: Path, rate_hz: float, config: TimingConfig | None = None) -> Pat
     lengths = np.abs(np.diff(spread, axis=0)).max(axis=1)
     positions = np.concatenate([[0.0], np.cumsum(lengths)])
     curve = toppra.SplineInterpolator(positions, spread)
-    limits = [
-        JointVelocityConstraint(np.full(ARM_JOINTS, config.velocity_rad_s)),
-        JointAccelerationConstraint(np.full(ARM_JOINTS, config.acceleration_rad_s2)),
-    ]
-    trajectory = TOPPRA(limits, curve, gridpoints=positions, solver_wrapper="seidel")
+    trajectory = TOPPRA(_limits(config), curve, gridpoints=positions, solver_wrapper="seidel")
     motion = trajectory.compute_trajectory()
     steps = int(np.ceil(motion.duration * rate_hz))
     times = np.minimum(np.arange(1, steps + 1) / rate_hz, motion.duration)
     return motion(times)
+
+
+@cache
+def _limits(config: TimingConfig) -> list[Constraint]:
+    return [
+        JointVelocityConstraint(np.full(ARM_JOINTS, config.velocity_rad_s)),
+        JointAccelerationConstraint(np.full(ARM_JOINTS, config.acceleration_rad_s2)),
+    ]
 
 
 def _respaced(path: Path, step_rad: float) -> Path:
