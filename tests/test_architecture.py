@@ -124,3 +124,14 @@ def test_constraints_pin_every_package_without_saying_where_from():
     pins = [line for line in lines if line and not line.startswith("#")]
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in pins), "a plain name==version"
     assert "torch==2.13.0" in pins
+
+
+def test_departures_from_the_paper_are_listed():
+    table = (ROOT / "DEVIATIONS.md").read_text()
+    listed = set(re.findall(r"^\| (D-[a-z-]+) \|", table, re.MULTILINE))
+    named = {
+        found for path in MODULES for found in re.findall(r"\bD-[a-z][a-z-]+", path.read_text())
+    }
+    assert named <= listed
+    places = set(re.findall(r"`((?:sacil_tasks|baselines|sacil_agent|leaderboard)/[^`]*)`", table))
+    assert not [place for place in places if not (ROOT / place).exists()]
