@@ -76,9 +76,7 @@ def sensor_configs(rig: dict[str, FixedCamera], hand: Link) -> list[CameraConfig
     ]
 
 
-def observe(
-    env: "SizedTableEnv", *, step: int, max_steps: int, gripper_open: bool
-) -> Observation:
+def observe(env: "SizedTableEnv", *, step: int, max_steps: int, gripper_open: bool) -> Observation:
     """Render all four cameras of the first environment now."""
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
     sensors = [env.scene.sensors[name] for name in CAMERAS]

@@ -13,9 +13,8 @@ from torch import Tensor
 class FingerContacts:
     """Reads forces between both fingers and the three candidates of every environment."""
 
-    def __init__(
-        self, scene: ManiSkillScene, agent: Panda, candidates: list[Actor | Link]
-    ) -> None:
+    def __init__(self, scene: ManiSkillScene, agent: Panda, candidates: list[Actor | Link]) -> None:
+        """Watch the fingers of `agent` and these candidates; lives as long as the scene."""
         self._scene = scene
         self._hand = agent.tcp
         self._fingers = (agent.finger1_link, agent.finger2_link)

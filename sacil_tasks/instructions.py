@@ -77,5 +77,5 @@ def check_template(spec: TaskSpec, template: int) -> None:
     count = len(all_templates(spec))
     if isinstance(template, bool) or not isinstance(template, int) or not 0 <= template < count:
         raise UsageError(
-            f"{spec.name} has templates 0 to {count - 1}, but {template!r} came; choose one of them."
+            f"{spec.name} has templates 0 to {count - 1}, but {template!r} came; take one of them."
         )

@@ -14,10 +14,12 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.structs import Actor, Articulation
 from sapien.wrapper.articulation_builder import LinkBuilder
+from torch import Tensor
 from transforms3d.euler import euler2quat
 
 Rgb = Sequence[float]
 Prop = TypeVar("Prop", Actor, Articulation)
+Length = TypeVar("Length", float, Tensor)
 
 BLOCK_DENSITY = 300.0
 CUP_MASS_KG = 0.06
@@ -70,7 +72,7 @@ def build_block(scene: ManiSkillScene, index: int, name: str, edge_m: float, rgb
     return builder.build_dynamic(name=name)
 
 
-def cup_height_m(diameter_m: float) -> float:
+def cup_height_m(diameter_m: Length) -> Length:
     """Height of a cup of this outer diameter."""
     return 1.3 * diameter_m
 
@@ -117,7 +119,7 @@ def _cup_mesh(diameter_m: float, wall_m: float) -> trimesh.Trimesh:
     wall = trimesh.creation.annulus(radius_m - wall_m, radius_m, height_m, sections=32)
     floor = trimesh.creation.cylinder(radius_m - wall_m / 2, CUP_FLOOR_M, sections=32)
     floor.apply_translation([0, 0, (CUP_FLOOR_M - height_m) / 2])
-    return trimesh.util.concatenate([wall, floor, _handle_mesh(diameter_m)])
+    return wall + floor + _handle_mesh(diameter_m)
 
 
 def _handle_mesh(diameter_m: float) -> trimesh.Trimesh:

@@ -36,9 +36,7 @@ class SizeFamily:
     def splits(self) -> tuple[str, ...]:
         """Splits whose three rungs exist on this ladder."""
         return tuple(
-            split
-            for split, first in FIRST_RUNG.items()
-            if first + CANDIDATES <= len(self.rungs_m)
+            split for split, first in FIRST_RUNG.items() if first + CANDIDATES <= len(self.rungs_m)
         )
 
 

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -64,6 +64,11 @@ class SizedTableEnv(BaseEnv):
         enhanced_determinism: bool = True,
         **kwargs: Any,
     ) -> None:
+        """Build the first scene; what is not named here goes to ManiSkill.
+
+        Raises:
+            UsageError: the camera rig is unknown.
+        """
         self._rig = cameras.RIGS[find_name(camera_rig, cameras.RIGS, "camera rig")]
         self._split = "canon"
         if reconfiguration_freq is None:
@@ -232,27 +237,31 @@ class SizedTableEnv(BaseEnv):
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")
         props.build_table(self.scene)
-        self._geometries = [scenes.draw_geometry(int(seed)) for seed in self._episode_seed]
-        sizes_m = [
-            sizes.sizes_m(self.task.family, self._split, g.labels, g.jitter)
-            for g in self._geometries
-        ]
+        geometries = [scenes.draw_geometry(int(seed)) for seed in self._episode_seed]
+        sizes_m = np.stack(
+            [sizes.sizes_m(self.task.family, self._split, g.labels, g.jitter) for g in geometries]
+        )
         self.candidates = [
-            props.build_each(
-                self.scene,
-                f"candidate_{k}",
-                lambda i, name, k=k: self._build_candidate(
-                    i, name, float(sizes_m[i][k]), self._geometries[i].rgb[k]
-                ),
-            )
+            self._build_batch(k, sizes_m[:, k], [g.rgb[k] for g in geometries])
             for k in range(sizes.CANDIDATES)
         ]
         self._load_extras()
-        self._create_state(np.stack(sizes_m))
+        self._create_state(np.stack([g.labels for g in geometries]), sizes_m)
 
-    def _create_state(self, sizes_m: Float64[np.ndarray, "b 3"]) -> None:
+    def _build_batch(
+        self, k: int, sizes_m: Float64[np.ndarray, "b"], rgbs: list[Float64[np.ndarray, "3"]]
+    ) -> Any:
+        """Build candidate `k` of every parallel scene."""
+
+        def build(i: int, name: str) -> Any:
+            return self._build_candidate(i, name, float(sizes_m[i]), rgbs[i].tolist())
+
+        return props.build_each(self.scene, f"candidate_{k}", build)
+
+    def _create_state(
+        self, labels: Int64[np.ndarray, "b 3"], sizes_m: Float64[np.ndarray, "b 3"]
+    ) -> None:
         """Allocate what belongs to the task and is not physics."""
-        labels = np.stack([geometry.labels for geometry in self._geometries])
         self._labels = torch.as_tensor(labels, device=self.device)
         self._sizes_m = torch.as_tensor(sizes_m, device=self.device, dtype=torch.float32)
         self._yaw_rad = torch.zeros_like(self._sizes_m)
@@ -299,9 +308,7 @@ class SizedTableEnv(BaseEnv):
     def _say(self, env_idx: Tensor, seeds: list[int], options: dict[str, Any]) -> None:
         """Choose the words: from the instruction stream, unless given."""
         for i, seed in zip(env_idx.tolist(), seeds, strict=True):
-            drawn, template = instructions.draw_words(
-                self.task, scenes.stream(seed, "instruction")
-            )
+            drawn, template = instructions.draw_words(self.task, scenes.stream(seed, "instruction"))
             words = options.get("slots", drawn)
             asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
             self._asked[i] = torch.tensor(asked)

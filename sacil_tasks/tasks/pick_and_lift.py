@@ -80,10 +80,11 @@ class PickAndLiftEnv(SizedTableEnv):
         edge_m, (at, yaw) = self.sizes_m[choice[0]], self._start_pose(choice[0])
         above = np.array([at[0], at[1], edge_m + 0.08])
         grasp = np.array([at[0], at[1], max(edge_m / 2, 0.0115)])
-        goal = self.goal.pose.p[0].cpu().numpy() + [0, 0, grasp[2] - edge_m / 2]
+        lift = grasp + np.array([0, 0, 0.10])
+        goal = self.goal.pose.p[0].cpu().numpy() + np.array([0, 0, grasp[2] - edge_m / 2])
         return [
             self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
             self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(grasp + [0, 0, 0.10], yaw, gripper_open=False, ignore_collisions=True),
+            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
             self._downwards(goal, yaw, gripper_open=False, ignore_collisions=False),
         ]

@@ -83,8 +83,9 @@ class PickUpCupEnv(SizedTableEnv):
         yaw = np.pi / 2 - (np.pi / 2 - heading) % np.pi
         grasp = np.array([at[0], at[1], max(height_m - 0.025, height_m / 2)])
         above = np.array([at[0], at[1], height_m + 0.08])
+        lift = grasp + np.array([0, 0, 0.20])
         return [
             self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
             self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(grasp + [0, 0, 0.20], yaw, gripper_open=False, ignore_collisions=True),
+            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
         ]
