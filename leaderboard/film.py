@@ -10,13 +10,14 @@ import imageio.v2 as imageio
 import numpy as np
 from jaxtyping import UInt8
 from mani_skill.envs.sapien_env import BaseEnv
+from torch import Tensor
 
 from leaderboard.records import EpisodeRecord
 from sacil_tasks.episode import Stage
 from sacil_tasks.errors import UsageError
 
-STEPS_PER_FRAME = 2
-FRAMES_PER_SECOND = 20
+STEPS_PER_FRAME = 4
+FRAMES_PER_SECOND = 10
 """Twice real time at 20 control steps a second."""
 
 _CAPTION_PIXELS = 64
@@ -27,16 +28,17 @@ _CHARACTERS = 60
 class Film(gym.Wrapper):
     """Renders ManiSkill's camera for people every few control steps."""
 
-    def __init__(self, env: gym.Env) -> None:
-        """Film `env`."""
+    def __init__(self, env: gym.Env, folder: Path) -> None:
+        """Film `env` into `folder`."""
         super().__init__(env)
+        self._folder = folder
         self._frames: list[UInt8[np.ndarray, "h w 3"]] = []
         self._steps = 0
 
     @classmethod
-    def of(cls, stage: Stage) -> Self:
+    def of(cls, stage: Stage, folder: Path) -> Self:
         """Put a camera between a stage's recorder and its environment."""
-        film = cls(stage.recorder.env)
+        film = cls(stage.recorder.env, folder)
         stage.recorder.env = film
         return film
 
@@ -52,7 +54,7 @@ class Film(gym.Wrapper):
         self._steps += 1
         return super().step(action)
 
-    def save(self, folder: Path, record: EpisodeRecord) -> None:
+    def save(self, record: EpisodeRecord) -> None:
         """Write the episode as mp4, named by its key and outcome; nothing if no step was made.
 
         Raises:
@@ -61,20 +63,20 @@ class Film(gym.Wrapper):
         if not self._frames:
             return
         words = f"{record.task}-{record.split}-{record.scene:04d}-{record.variation}"
-        path = folder / f"{words}-{record.outcome.lower()}.mp4"
+        path = self._folder / f"{words}-{record.outcome.lower()}.mp4"
         strip = caption(record, width=self._frames[0].shape[1])
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with imageio.get_writer(path, fps=FRAMES_PER_SECOND) as writer:
-                for frame in self._frames:
-                    writer.append_data(np.concatenate([strip, frame]))
+            self._folder.mkdir(parents=True, exist_ok=True)
+            frames = [np.concatenate([strip, frame]) for frame in self._frames]
+            imageio.mimwrite(path, cast(list[Any], frames), fps=FRAMES_PER_SECOND)
         except OSError as error:
             raise UsageError(
                 f"cannot write {path}: {error}. Choose another folder with --out, or drop --video."
             ) from error
 
     def _render(self) -> UInt8[np.ndarray, "h w 3"]:
-        return cast(BaseEnv, self.env.unwrapped).render_rgb_array()[0].cpu().numpy()
+        image: Tensor = cast(BaseEnv, self.env.unwrapped).render_rgb_array()[0]
+        return image.cpu().numpy()
 
 
 def caption(record: EpisodeRecord, width: int) -> UInt8[np.ndarray, "h w 3"]:

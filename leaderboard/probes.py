@@ -28,21 +28,18 @@ class Probe(Protocol):
     def begin_on(self, stage: "Stage", rng: np.random.Generator) -> Memory:
         """Start an episode on a stage whose scene is built; `rng` is the episode's own."""
 
-    def act_on(self, stage: "Stage", memory: Memory) -> tuple[Keyframe, Memory]:
-        """Choose the next keyframe."""
+    def act_on(self, stage: "Stage", memory: Memory) -> tuple[Keyframe, Memory] | None:
+        """Choose the next keyframe; None gives the rest of the budget away."""
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """The expert's keyframes for one choice of candidates, and how far it has come."""
+    """The expert's keyframes for some candidates, and how far it has come."""
 
-    choice: tuple[int, ...] | None
-    """Candidates to handle in order; None for the named ones."""
+    choice: tuple[int, ...]
+    """Indices of the candidates to handle, in order."""
 
-    last: int
-    """Index of the last keyframe; it is repeated once the plan is through."""
-
-    next: int = 0
+    done: int = 0
 
 
 class Oracle:
@@ -52,12 +49,14 @@ class Oracle:
 
     def begin_on(self, stage: "Stage", rng: np.random.Generator) -> _Plan:
         """The named candidates."""
-        return _Plan(None, last=stage.spec.keyframes - 1)
+        return _Plan(stage.env.target_order())
 
-    def act_on(self, stage: "Stage", memory: _Plan) -> tuple[Keyframe, _Plan]:
+    def act_on(self, stage: "Stage", memory: _Plan) -> tuple[Keyframe, _Plan] | None:
         """The next keyframe of the plan."""
-        keyframe = stage.expert_keyframe(memory.next, memory.choice)
-        return keyframe, replace(memory, next=min(memory.next + 1, memory.last))
+        if memory.done == stage.spec.keyframes:
+            return None
+        keyframe = stage.expert_keyframe(memory.done, memory.choice)
+        return keyframe, replace(memory, done=memory.done + 1)
 
 
 class Blind(Oracle):
@@ -65,9 +64,8 @@ class Blind(Oracle):
 
     def begin_on(self, stage: "Stage", rng: np.random.Generator) -> _Plan:
         """As many candidates as the words name."""
-        named = len(stage.env.target_order())
-        choice = rng.permutation(CANDIDATES)[:named]
-        return _Plan(tuple(int(index) for index in choice), last=stage.spec.keyframes - 1)
+        choice = rng.permutation(CANDIDATES)[: len(stage.env.target_order())]
+        return _Plan(tuple(choice.tolist()))
 
 
 class Hold:
@@ -77,8 +75,7 @@ class Hold:
 
     def begin_on(self, stage: "Stage", rng: np.random.Generator) -> Keyframe:
         """The pose at the start."""
-        agent = stage.env.agent
-        pose = (agent.robot.pose.inv() * agent.tcp_pose).raw_pose[0].double().numpy()
+        pose = stage.env.tcp_in_base()[0].double().numpy()
         return Keyframe(pose[:3], pose[3:], gripper_open=True, ignore_collisions=True)
 
     def act_on(self, stage: "Stage", memory: Keyframe) -> tuple[Keyframe, Keyframe]:

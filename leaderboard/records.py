@@ -155,8 +155,8 @@ class EpisodeLog:
                 f"another run is writing {path}. Wait for it or choose another folder with --out."
             ) from error
         self.path = path
-        self._drop_cut_line()
         self.records = read_records(path)
+        self._drop_cut_line()  # only now: a foreign file is left as it is
 
     def append(self, record: EpisodeRecord) -> None:
         """Write one line to disk.

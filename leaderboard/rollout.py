@@ -67,28 +67,20 @@ class SceneRunner:
         return [self._play_one(key) for key in job.keys]
 
     def _play_one(self, key: EpisodeKey) -> EpisodeRecord:
-        stage = self._stage_for(key.task)
-        record = run_episode(stage, self._policy, self._entry, key)
-        if self._film is not None and self._videos is not None:
-            self._film.save(self._videos, record)
-        if record.errored:
-            self._close()  # whatever broke, the next episode starts from a fresh simulator
+        record = run_episode(self._stage_for(key.task), self._policy, self._entry, key)
+        if self._film is not None:
+            self._film.save(record)
         return record
 
     def _stage_for(self, task: str) -> Stage:
         if self._stage is None or self._stage.task != task:
-            self._close()
+            if self._stage is not None:
+                self._stage.close()
             # Probes do not look, so they run where nothing can render.
             render = self._videos is not None or not self._entry.privileged
             self._stage = Stage(task, render=render)
-            self._film = Film.of(self._stage) if self._videos else None
+            self._film = Film.of(self._stage, self._videos) if self._videos else None
         return self._stage
-
-    def _close(self) -> None:
-        self._film = None
-        if self._stage is not None:
-            self._stage.close()
-            self._stage = None
 
 
 def run_episode(
@@ -159,9 +151,12 @@ def _play(
     """Keyframe after keyframe, until the first lenient success, a refusal or the limit."""
     for _ in range(MAX_KEYFRAMES):
         if privileged:
-            keyframe, memory = cast(Probe, policy).act_on(stage, memory)
+            move = cast(Probe, policy).act_on(stage, memory)
         else:
-            keyframe, memory = _look_and_act(stage, cast(Policy, policy), memory, course)
+            move = _look_and_act(stage, cast(Policy, policy), memory, course)
+        if move is None:
+            return
+        keyframe, memory = move
         result = stage.execute(keyframe)
         if result.refusal is not None:
             course.end, course.reason = INVALID_ACTION, result.refusal

@@ -1,0 +1,72 @@
+import os
+
+import pytest
+from made_up import make_records
+
+from leaderboard.records import EPISODES_FILE, EpisodeLog, EpisodeRecord, doubts, read_records
+from sacil_tasks.errors import UsageError
+
+
+def test_a_record_survives_its_line():
+    record = make_records(sizes_m=(0.03, 0.04, 0.05), reason='a "quoted"\nline é')[0]
+    line = record.to_json()
+    assert "\n" not in line
+    assert EpisodeRecord.from_json(line) == record
+
+
+@pytest.mark.parametrize("cut", [1, 7, 100])
+def test_a_line_cut_by_kill_is_dropped_and_nothing_else(run_folder, cut):
+    log = run_folder / EPISODES_FILE
+    before = read_records(log)
+    os.truncate(log, log.stat().st_size - cut)
+    assert read_records(log) == before[:-1]
+    with EpisodeLog(run_folder) as reopened:
+        assert reopened.records == before[:-1]
+        reopened.append(before[-1])
+    assert read_records(log) == before
+
+
+@pytest.mark.parametrize("junk", ["{}", "nonsense", '{"schema_version": 99}', "\x00\x00", "[1]"])
+def test_a_foreign_line_is_refused_and_left_alone(run_folder, junk):
+    log = run_folder / EPISODES_FILE
+    content = junk + "\n" + log.read_text()[:-5]
+    log.write_text(content)
+    with pytest.raises(UsageError, match="line 1 is not an episode record"):
+        EpisodeLog(run_folder)
+    assert log.read_text() == content
+
+
+def test_an_episode_twice_is_refused(run_folder):
+    log = run_folder / EPISODES_FILE
+    log.write_text(log.read_text() * 2)
+    with pytest.raises(UsageError, match="twice"):
+        read_records(log)
+
+
+def test_a_second_writer_is_refused(run_folder):
+    with EpisodeLog(run_folder), pytest.raises(UsageError, match="another run is writing"):
+        EpisodeLog(run_folder)
+    EpisodeLog(run_folder)
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="choose another folder with --out"):
+        EpisodeLog(tmp_path / "file" / "run")
+
+
+def test_a_full_disk_is_one_sentence_and_keeps_what_was_written(run_folder):
+    with EpisodeLog(run_folder) as log:
+        log._stream = open("/dev/full", "wb", buffering=0)  # noqa: SIM115, SLF001
+        with pytest.raises(UsageError, match="No space left"):
+            log.append(make_records()[0])
+    assert len(read_records(run_folder / EPISODES_FILE)) == 6
+
+
+def test_images_that_change_with_the_words_are_doubted():
+    same = make_records(pixels="a", renderer="x")
+    assert doubts(same) == []
+    other = make_records(pixels="b", renderer="x")
+    assert "did not look the same" in doubts([*same[:1], *other[1:]])[0]
+    elsewhere = make_records(pixels="b", renderer="y")
+    assert "different renderers" in doubts([*same[:1], *elsewhere[1:]])[0]
