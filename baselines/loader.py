@@ -56,17 +56,17 @@ class Loader:
         Goals have their own random stream, so they never change what behaviour cloning sees.
         """
         samples = self.keyframes.draw(stream(self._seed, step, "rows"), self._recipe.batch)
-        views, moves = self._views(samples, self._mover(step, "moves"))
+        views, moves = self.views(samples, self._mover(step, "moves"))
         goals = None
         if self._goals:
-            goals, _ = self._views(self._next(samples), self._mover(step, "goals"))
+            goals, _ = self.views(self._next(samples), self._mover(step, "goals"))
         if self._recipe.image_noise:
             self._add_noise([views] if goals is None else [views, goals], step)
         return self._assemble(samples, views, moves, goals)
 
     def plain(self, samples: Sequence[Sample]) -> Batch:
         """A batch of these samples without augmentation, noise or goals."""
-        views, moves = self._views(samples, lambda _: STILL)
+        views, moves = self.views(samples, lambda _: STILL)
         return self._assemble(samples, views, moves, None)
 
     def _mover(self, step: int, name: str) -> Move:
@@ -77,7 +77,7 @@ class Loader:
         shards = self.keyframes.shards
         return [Sample(s.shard, int(shards[s.shard].columns["next_index"][s.row])) for s in samples]
 
-    def _views(self, samples: Sequence[Sample], mover: Move) -> tuple[Tensor, list[Augmentation]]:
+    def views(self, samples: Sequence[Sample], mover: Move) -> tuple[Tensor, list[Augmentation]]:
         """Views of each sample's scene after its own move, and the moves."""
         side = self._pixels
         views = np.empty((len(samples), len(VIEWS), len(CHANNELS), side, side), np.float32)

@@ -51,14 +51,12 @@ class Shard:
         """Read a whole keyframe file.
 
         Raises:
-            UsageError: missing, truncated, foreign or empty file.
+            UsageError: missing, truncated or foreign file.
         """
         with KeyframeFile.open(path) as file:
             columns = {name: file.column(name) for name in OBSERVATION_COLUMNS}
             task, sha256 = file.meta.task, file.content_sha256
             episodes, first_rows = file.episodes, file.first_rows
-        if not episodes:
-            raise UsageError(f"{path} holds no demos. {_gen_demos(task)}")
         return cls(task, path, sha256, episodes, first_rows, columns)
 
     def __len__(self) -> int:

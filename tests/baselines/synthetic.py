@@ -40,8 +40,9 @@ def write_file(
 
 def demo(rng: np.random.Generator, index: int) -> KeyframeDemo:
     """Go above a candidate, down to it, and up again."""
-    target, center = index % 3, np.array(SCENE_BOUNDS.center_in_base)
-    candidates = center + [[0, -0.2, -0.2], [0, 0, -0.2], [0, 0.2, -0.2]]
+    target = index % 3
+    candidates = np.array([[0, -0.2, -0.2], [0, 0, -0.2], [0, 0.2, -0.2]])
+    candidates += SCENE_BOUNDS.center_in_base
     candidates[:, 0] += rng.uniform(-0.1, 0.1, 3)
     heights = (0.1, 0.0, 0.2)
     keyframes = [
@@ -68,7 +69,8 @@ def demo(rng: np.random.Generator, index: int) -> KeyframeDemo:
 def observation(rng: np.random.Generator, step: int) -> Observation:
     """Four cameras that look straight down at noise; a quarter of the pixels saw nothing."""
     camera = np.diag([1.0, -1.0, -1.0, 1.0])
-    camera[:3, 3] = np.array(SCENE_BOUNDS.center_in_base) + [0, 0, 0.6]
+    camera[:3, 3] = SCENE_BOUNDS.center_in_base
+    camera[2, 3] += 0.6
     depth = rng.integers(500, 900, (4, 128, 128))
     return Observation(
         rgb=rng.integers(0, 256, (4, 128, 128, 3), np.uint8),

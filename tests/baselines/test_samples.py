@@ -1,0 +1,184 @@
+from collections import Counter
+from dataclasses import fields, replace
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+import torch
+
+from baselines.agent import Recipe
+from baselines.augment import Augmentation, AugmentConfig
+from baselines.loader import Loader
+from baselines.rotation import bins_to_quaternion
+from baselines.samples import KeyframeSet, Sample, Shard, stream
+from baselines.text import SentenceTable, TextSpec, tidy
+from baselines.views import base_from_cube
+from sacil_tasks.errors import UsageError
+
+TASKS = ("pick_and_lift", "pick_up_cup")
+NO_MOVE = Augmentation(0.0, np.zeros(3))
+STILL = AugmentConfig(yaw_rad=0.0, translation_m=0.0)
+
+
+@pytest.fixture(scope="module")
+def keyframes(data):
+    return KeyframeSet.load(data / "canon/train/keyframes", TASKS)
+
+
+def loader(keyframes, *, seed=0, goals=False, **recipe):
+    sentences = {tidy(e.instruction) for shard in keyframes.shards for e in shard.episodes}
+    rng = np.random.default_rng(0)
+    table = {s: rng.normal(size=(len(s.split()), 8)).astype(np.float16) for s in sorted(sentences)}
+    return Loader(
+        keyframes,
+        SentenceTable(TextSpec("fake", 8, 32, "0"), table),
+        pixels=16,
+        recipe=Recipe(batch=6, **recipe),
+        seed=seed,
+        goals=goals,
+    )
+
+
+def tensors(batch):
+    """All tensors of a batch but its goals, by name."""
+    parts = [batch.inputs, batch.labels, batch]
+    named = {f.name: getattr(part, f.name) for part in parts for f in fields(part)}
+    return {n: t for n, t in named.items() if isinstance(t, torch.Tensor) and n != "goal_views"}
+
+
+def assert_same(first, second):
+    assert all(torch.equal(t, tensors(second)[n]) for n, t in tensors(first).items())
+
+
+def test_a_batch_is_a_function_of_seed_and_step(keyframes):
+    assert_same(loader(keyframes, seed=3).batch(7), loader(keyframes, seed=3).batch(7))
+    views = [loader(keyframes, seed=s).batch(n).inputs.views for s, n in ((3, 7), (3, 8), (4, 7))]
+    assert not torch.equal(views[0], views[1])
+    assert not torch.equal(views[0], views[2])
+
+
+def test_goals_and_noise_do_not_change_what_behaviour_cloning_sees(keyframes):
+    plain, with_goals = loader(keyframes), loader(keyframes, goals=True)
+    noisy = loader(keyframes, image_noise=0.1)
+    for step in range(5):
+        expected = plain.batch(step)
+        assert expected.goal_views is None
+        assert_same(expected, with_goals.batch(step))
+        blurred = noisy.batch(step)
+        assert torch.equal(expected.labels.position_in_cube, blurred.labels.position_in_cube)
+        noise = blurred.inputs.views - expected.inputs.views.clamp(-1, 1)
+        assert 0 < noise.abs().max() <= 0.1 + 1e-6
+
+
+def test_every_batch_tells_two_sizes_of_one_task_apart(keyframes):
+    for step in range(200):
+        samples = keyframes.draw(stream(0, step, "rows"), 2)
+        assert len({keyframes.meaning(s) for s in samples}) > len({s.shard for s in samples})
+
+
+def test_tasks_then_demos_are_drawn_uniformly(tmp_path):
+    synthetic.write_file(tmp_path, "pick_and_lift", demos=3)
+    synthetic.write_file(tmp_path, "pick_up_cup", demos=12)
+    keyframes = KeyframeSet.load(tmp_path / "canon/train/keyframes", TASKS)
+    drawn = [s for step in range(250) for s in keyframes.draw(stream(1, step, "rows"), 16)]
+    tasks = Counter(sample.shard for sample in drawn)
+    demos = Counter((sample.shard, keyframes.episode(sample)) for sample in drawn)
+    assert tasks[0] / len(drawn) == pytest.approx(0.5, abs=0.03)
+    assert min(demos[0, e] for e in range(3)) > 0.8 * tasks[0] / 3
+    assert min(demos[1, e] for e in range(12)) > 0.7 * tasks[1] / 12
+
+
+def test_only_observations_with_a_keyframe_are_samples(keyframes):
+    samples = keyframes.everything()
+    assert len(samples) == len(TASKS) * 6 * synthetic.KEYFRAMES
+    assert all(keyframes.shards[s.shard].columns["next_index"][s.row] >= 0 for s in samples)
+
+
+def test_goal_is_the_next_observation(keyframes):
+    batch = loader(keyframes, goals=True, augment=STILL).batch(0)
+    drawn = keyframes.draw(stream(0, 0, "rows"), 6)
+    after = [Sample(s.shard, s.row + 1) for s in drawn]
+    # Of an observation that leads nowhere `plain` has no label, but it has views.
+    views = loader(keyframes).views(after, lambda _: NO_MOVE)[0]
+    assert torch.equal(batch.goal_views, views)
+
+
+def test_goals_are_moved_by_their_own_draw(keyframes):
+    fixed, moved = (loader(keyframes, goals=True, **r) for r in ({"augment": STILL}, {}))
+    assert not torch.equal(fixed.batch(0).goal_views, moved.batch(0).goal_views)
+
+
+def test_labels_without_augmentation_are_the_commanded_keyframes(keyframes):
+    samples = keyframes.everything()[:6]
+    labels = loader(keyframes).plain(samples).labels
+    asked = np.stack(
+        [keyframes.shards[s.shard].columns["keyframe_in_base"][s.row] for s in samples]
+    )
+    np.testing.assert_allclose(base_from_cube(labels.position_in_cube), asked[:, :3], atol=1e-6)
+    turn = bins_to_quaternion(labels.rotation_bins).numpy()
+    np.testing.assert_allclose(np.abs((turn * asked[:, 3:]).sum(-1)), 1, atol=1e-6)
+    assert labels.gripper_open.tolist() == [1, 0, 0] * 2
+    assert labels.ignore_collisions.tolist() == [0, 1, 0] * 2
+
+
+def test_label_and_cloud_move_together(keyframes):
+    """A scene of one point at the label: wherever it is moved, it is drawn at the label."""
+    columns = {name: column.copy() for name, column in keyframes.shards[0].columns.items()}
+    columns["depth_mm"][:] = 0
+    columns["depth_mm"][:, 0, 40, 80] = 700
+    seen = keyframes.shards[0].observation(0)
+    ray = np.linalg.inv(seen.intrinsics[0]) @ [80.5, 40.5, 1] * 0.7
+    columns["keyframe_in_base"][:, :3] = (seen.camera_in_base[0] @ [*ray, 1])[:3]
+    scene = KeyframeSet([replace(keyframes.shards[0], columns=columns)])
+    batch = loader(scene).batch(0)
+    for views, label in zip(batch.inputs.views, batch.labels.position_in_cube, strict=True):
+        xyz = views[:, :3].permute(0, 2, 3, 1)[views[:, 3:6].sum(1) > 0]
+        assert len(xyz) > 0
+        torch.testing.assert_close(xyz, label.expand_as(xyz), atol=2e-3, rtol=0)
+
+
+def test_time_runs_down_and_the_first_keyframe_is_marked(keyframes):
+    batch = loader(keyframes).plain(keyframes.everything()[:3])
+    assert batch.inputs.proprio[:, 1].tolist() == pytest.approx([1, 1 - 2 / 24, 1 - 4 / 24])
+    assert batch.first.tolist() == [True, False, False]
+
+
+def test_paraphrases_share_a_meaning_and_demos_a_trajectory(keyframes):
+    batch = loader(keyframes).plain(keyframes.everything())
+    by_demo = list(zip(batch.task.tolist(), batch.meaning.tolist(), strict=True))
+    assert len(set(by_demo)) == len(set(batch.meaning.tolist())) == 6  # two tasks, three sizes
+    assert len(set(batch.trajectory.tolist())) == 12
+
+
+def test_images_stay_as_stored(keyframes):
+    shard = keyframes.shards[0]
+    assert (shard.columns["rgb"].dtype, shard.columns["depth_mm"].dtype) == (np.uint8, np.uint16)
+    assert shard.observation(0).rgb.base is not None
+
+
+def test_a_missing_file_names_the_command_that_makes_it(tmp_path):
+    with pytest.raises(UsageError, match="gen_demos --tasks pick_and_lift"):
+        KeyframeSet.load(tmp_path, ["pick_and_lift"])
+
+
+def test_demos_of_one_size_cannot_teach_size(tmp_path):
+    synthetic.write_file(tmp_path, "pick_and_lift", demos=1)
+    keyframes = KeyframeSet.load(tmp_path / "canon/train/keyframes", ["pick_and_lift"])
+    with pytest.raises(UsageError, match="single size"):
+        loader(keyframes).batch(0)
+
+
+@pytest.mark.parametrize("damage", ["empty", "truncated", "foreign"])
+def test_a_damaged_file_is_named(tmp_path, damage):
+    path = synthetic.write_file(
+        tmp_path, "pick_and_lift", demos=0 if damage == "without demos" else 2
+    )
+    if damage == "empty":
+        path.write_bytes(b"")
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[:5000])
+    if damage == "foreign":
+        h5py.File(path, "w").close()
+    with pytest.raises(UsageError, match=r"pick_and_lift\.h5"):
+        Shard.load(path)
