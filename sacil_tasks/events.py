@@ -86,15 +86,21 @@ class Events:
         along[:, 1] *= -1
         squeezes = pushes & (along >= _GRASP_COSINE * strength)
         self.grasped = squeezes.all(dim=1)
+        self.held_steps *= self.grasped
 
     def release(self) -> None:
         """Take in that no finger touches any candidate."""
         self.grasped.zero_()
         self.held_steps.zero_()
 
-    def carry(self, positions: Float[Tensor, "b 3 3"]) -> None:
-        """Take in where candidates are: those held away from their start become acquired."""
+    def carry(self, positions: Float[Tensor, "b 3 3"], *, skip_resting: bool) -> None:
+        """Take in where candidates are: those held away from their start become acquired.
+
+        `skip_resting` asks first whether there is anything to latch: quick on the CPU only.
+        """
         moved = positions - self.start
+        if skip_resting and not self.grasped.any() and moved.abs().max() < RAISED_M:
+            return
         carried = (moved[..., 2] > RAISED_M) | (moved[..., :2].norm(dim=-1) > CARRIED_M)
         self.held_steps = (self.held_steps + 1) * (self.grasped & carried)
         self.handle(self.held_steps >= ACQUIRED_STEPS)

@@ -21,12 +21,13 @@ from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, contacts, instructions, props, scenes, sizes
+from sacil_tasks import cameras, instructions, props, scenes, sizes
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
 from sacil_tasks.instructions import Slots
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
+from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
 
 HOME_QPOS = (0.0, 0.0, 0.0, -1.5, 0.0, 1.5, np.pi / 4, 0.04, 0.04)
@@ -127,7 +128,7 @@ class SizedTableEnv(BaseEnv):
 
     def target_order(self, i: int = 0) -> tuple[int, ...]:
         """Indices of the named candidates of environment `i`, in the order named."""
-        return tuple(self._targets()[i].tolist())
+        return tuple(self._targets[i].tolist())
 
     @property
     def candidate_labels(self) -> tuple[str, ...]:
@@ -146,7 +147,7 @@ class SizedTableEnv(BaseEnv):
 
     def candidate_in_base(self) -> Float32[np.ndarray, "3 3"]:
         """Positions of the candidates of environment 0 now, in the base frame (m)."""
-        return self._positions()[0].cpu().numpy() - self.base_in_world_m
+        return self._sensor.positions()[0].cpu().numpy() - self.base_in_world_m
 
     def tcp_in_base(self) -> Float[Tensor, "b 7"]:
         """Gripper pose: position (m) and quaternion wxyz in the base frame."""
@@ -270,7 +271,7 @@ class SizedTableEnv(BaseEnv):
         )
         self._template = torch.zeros((self.num_envs, 1), dtype=torch.int64, device=self.device)
         self.events = Events.create(self.num_envs, self.device)
-        self._contacts = contacts.FingerContacts(self.scene, self.agent, self._candidate_links())
+        self._sensor = CandidateSensor(self.scene, self.agent, self.candidates, self._touchable())
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         """Fixed, shadowless light: part of the benchmark's definition."""
@@ -313,25 +314,24 @@ class SizedTableEnv(BaseEnv):
             asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
             self._asked[i] = torch.tensor(asked)
             self._template[i] = options.get("template", template)
+        self._find_targets()
 
     def _after_control_step(self) -> None:
         self._update_events()
 
     def _touch_and_carry(self) -> None:
-        forces_n = self._contacts.forces_n()
+        forces_n = self._sensor.forces_n()
         if forces_n is None:
             self.events.release()
         else:
-            self.events.touch(forces_n, self._contacts.closing())
-        self.events.carry(self._positions())
+            self.events.touch(forces_n, self._sensor.closing())
+        self.events.carry(self._sensor.positions(), skip_resting=not self._sensor.batched)
 
     def evaluate(self) -> dict[str, Tensor]:
         """Success now, strict and lenient, and the latches. Nothing here tells the target."""
-        targets = self._targets()
-        lenient = self._lenient_success(targets)
-        named = torch.zeros_like(self.events.displaced).scatter_(1, targets, value=True)
+        lenient = self._lenient_success(self._targets)
         spoilt = (self.events.handle_order > 0) | self.events.displaced
-        strict = lenient & ~(spoilt & ~named).any(-1)
+        strict = lenient & ~(spoilt & self._unnamed).any(-1)
         return {
             "success": strict,
             "success_strict": strict.clone(),
@@ -370,16 +370,17 @@ class SizedTableEnv(BaseEnv):
                 saved = torch.as_tensor(state["task"][name], dtype=own.dtype, device=self.device)
                 own[env_idx] = saved.view(-1, own.shape[1])
             self.events.set_state(state["task"], env_idx)
+            self._find_targets()
 
     # Helpers -------------------------------------------------------------------------------------
 
-    def _targets(self) -> Int[Tensor, "b n"]:
-        return (self._labels[:, None] == self._asked[..., None]).int().argmax(-1)
+    def _find_targets(self) -> None:
+        """Resolve the words into candidates; called when words change."""
+        named = self._labels[:, None] == self._asked[..., None]
+        self._targets = named.int().argmax(-1)
+        self._unnamed = ~named.any(1)
 
-    def _positions(self) -> Float[Tensor, "b 3 3"]:
-        return torch.stack([candidate.pose.p for candidate in self.candidates], dim=1)
-
-    def _candidate_links(self) -> list[Actor | Link]:
+    def _touchable(self) -> list[Actor | Link]:
         """The body of each candidate that fingers act on."""
         return list(self.candidates)
 

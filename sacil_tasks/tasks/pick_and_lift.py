@@ -73,7 +73,7 @@ class PickAndLiftEnv(SizedTableEnv):
         self.goal.set_pose(Pose.create_from_pq(goals_m.to(self.device)))
 
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
-        gaps_m = (self._positions() - self.goal.pose.p[:, None]).norm(dim=-1)
+        gaps_m = (self._sensor.positions() - self.goal.pose.p[:, None]).norm(dim=-1)
         return self._pick((gaps_m <= GOAL_TOLERANCE_M) & self.events.grasped, targets)
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:

@@ -68,13 +68,12 @@ class PickUpCupEnv(SizedTableEnv):
 
     def _lowest_points_m(self) -> Float[Tensor, "b 3"]:
         """Height of each cup's lowest point, the cup taken as a cylinder."""
-        quaternions = torch.stack([cup.pose.q for cup in self.candidates], dim=1)
-        upright = (1 - 2 * quaternions[..., 1:3].square().sum(-1)).clamp(-1, 1)
+        upright = (1 - 2 * self._sensor.quaternions()[..., 1:3].square().sum(-1)).clamp(-1, 1)
         reach_m = (
             props.cup_height_m(self._sizes_m) * upright.abs()
             + self._sizes_m * (1 - upright.square()).sqrt()
         )
-        return self._positions()[..., 2] - reach_m / 2
+        return self._sensor.positions()[..., 2] - reach_m / 2
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         height_m = props.cup_height_m(self.sizes_m[choice[0]])

@@ -72,7 +72,7 @@ class PushButtonsEnv(SizedTableEnv):
             button.set_qpos(torch.zeros((len(env_idx), 1)))
         self._show_pressed()
 
-    def _candidate_links(self) -> list[Link]:
+    def _touchable(self) -> list[Link]:
         return [button.links_map["cap"] for button in self.candidates]
 
     def _update_events(self) -> None:
