@@ -1,0 +1,68 @@
+"""RVT's published size, and what may look at what."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from networks import TEXT, changed, make_inputs, tiny
+
+from baselines.agents.rvt import CPU, PAPER, Rvt, RvtConfig
+from baselines.multiview import last_token, trimmed_text, within_views
+from baselines.text import TextSpec
+from sacil_tasks.errors import UsageError
+
+CONFIG = tiny(CPU)
+
+
+@pytest.fixture
+def network() -> Rvt:
+    torch.manual_seed(0)
+    return Rvt(CONFIG, TEXT)
+
+
+def test_the_paper_preset_has_the_published_number_of_parameters() -> None:
+    clip = TextSpec(name="clip", dim=512, max_tokens=77, fingerprint="")
+    with torch.device("meta"):
+        published = Rvt(replace(PAPER, proprio_width=4), clip)
+        ours = Rvt(PAPER, clip)
+    assert sum(p.numel() for p in published.parameters()) == 36_348_093
+    # Two proprioceptive numbers instead of four (D-proprio).
+    assert sum(p.numel() for p in ours.parameters()) == 36_348_093 - 2 * 64
+
+
+def test_view_layers_keep_views_apart(network: Rvt) -> None:
+    tokens = torch.randn(1, 5 * CONFIG.grid**2, CONFIG.width)
+    touched = tokens.clone()
+    touched[:, : CONFIG.grid**2] += 1
+    with torch.no_grad():
+        before = within_views(network.view_blocks, tokens).unflatten(1, (5, -1))
+        after = within_views(network.view_blocks, touched).unflatten(1, (5, -1))
+    assert not torch.allclose(before[:, 0], after[:, 0])
+    assert torch.equal(before[:, 1:], after[:, 1:])
+
+
+@pytest.mark.parametrize("field", ["views", "text", "proprio"])
+def test_every_view_hears_of_a_change_in(network: Rvt, field: str) -> None:
+    inputs = make_inputs(CONFIG.pixels, size=1)
+    value = getattr(inputs, field).clone()
+    value[:, 0] += 1
+    with torch.no_grad():
+        before = network(inputs).heatmaps
+        after = network(changed(inputs, **{field: value})).heatmaps
+    assert ((before - after).abs().amax(dim=(-1, -2)) > 0).all()
+
+
+def test_text_is_trimmed_to_the_longest_sentence() -> None:
+    inputs = make_inputs(CONFIG.pixels)
+    text, mask = trimmed_text(inputs)
+    assert text.shape[1] == mask.shape[1] == int(inputs.text_mask.sum(1).max())
+    assert torch.equal(last_token(inputs)[2], inputs.text[2, int(inputs.text_mask[2].sum()) - 1])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"pixels": 100}, "multiple of --patch"), ({"patch": 8, "pixels": 96}, "--pyramid")],
+)
+def test_sizes_that_do_not_fit_are_refused(change: dict[str, int], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        replace(RvtConfig(), **change)
