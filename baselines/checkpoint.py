@@ -205,7 +205,7 @@ def find_released(agent: str, tasks: Sequence[str]) -> Path:
         UsageError: none does.
     """
     spec, _ = find_agent(agent)
-    for config in sorted(_released(spec.name).glob(f"*/{CONFIG}")):
+    for config in sorted(released_folder(spec.name).glob(f"*/{CONFIG}")):
         identity = Identity.load(config.parent)
         if identity.name == agent and set(tasks) <= set(identity.tasks):
             return config.parent
@@ -216,7 +216,8 @@ def find_released(agent: str, tasks: Sequence[str]) -> Path:
     )
 
 
-def _released(agent: str) -> Path:
+def released_folder(agent: str) -> Path:
+    """Where the package of `agent` keeps its released checkpoints, one folder a suite."""
     package = importlib.util.find_spec(agent_modules()[agent].partition(".")[0])
     if package is None or package.origin is None:
         raise UsageError(f"the package of the agent {agent} has no folder.")

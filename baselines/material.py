@@ -15,7 +15,7 @@ from baselines.samples import KeyframeSet
 from baselines.text import SentenceTable, cached_table
 from baselines.trainer import Trainer, Validator
 from baselines.validate import validate
-from sacil_tasks.catalog import task_names, task_spec
+from sacil_tasks.catalog import task_spec
 from sacil_tasks.instructions import official_sentences
 
 SPLIT = "canon"
@@ -94,10 +94,8 @@ def _keyframes(data: Path, partition: str) -> Path:
 
 def sentences_of(keyframes: KeyframeSet) -> dict[Path, set[str]]:
     """The sentences of each keyframe file, and all official ones of its task."""
-    sentences = {}
-    for shard in keyframes.shards:
-        said = {episode.instruction for episode in shard.episodes}
-        if shard.task in task_names():
-            said.update(official_sentences(task_spec(shard.task)))
-        sentences[shard.path] = said
-    return sentences
+    return {
+        shard.path: {e.instruction for e in shard.episodes}
+        | set(official_sentences(task_spec(shard.task)))
+        for shard in keyframes.shards
+    }

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from baselines.agent import find_agent
-from sacil_tasks.catalog import suite_tasks
-from sacil_tasks.errors import UsageError
+from sacil_tasks.catalog import suite_tasks, task_names
+from sacil_tasks.errors import UsageError, find_name
 
 DEFAULT_SUITE = "slice"
 
@@ -83,9 +83,11 @@ class TrainConfig:
         """Tasks to train on.
 
         Raises:
-            UsageError: no such suite.
+            UsageError: no such task or suite.
         """
-        return self.tasks or suite_tasks(self.suite or DEFAULT_SUITE)
+        for task in self.tasks:
+            find_name(task, task_names(), "task")
+        return tuple(dict.fromkeys(self.tasks)) or suite_tasks(self.suite or DEFAULT_SUITE)
 
     @property
     def folder(self) -> Path:

@@ -86,7 +86,7 @@ class Trainer:
         start = time.perf_counter()
         batch = self._loader.batch(self.step)
         loaded = time.perf_counter()
-        terms = self._learn(batch)
+        terms = self.learn(batch)
         learnt = time.perf_counter()
         self._optimiser.step(self.lr)
         self._ema.update(self.step)
@@ -104,16 +104,20 @@ class Trainer:
         peak, warmup = self.recipe.lr, self.recipe.warmup_steps
         return learning_rate(self.step, total=self.steps, peak=peak, warmup=warmup)
 
-    def _learn(self, batch: Batch) -> dict[str, float]:
-        """Forward and backward."""
+    def learn(self, batch: Batch) -> dict[str, float]:
+        """Forward and backward; returns the loss and its terms.
+
+        Raises:
+            UsageError: the loss is not finite.
+        """
         # Dropout draws from torch's global generator: fix it by step, or a resumed run differs.
         torch.manual_seed(int(stream(self._seed, self.step, "torch").integers(2**63)))
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.precision == "bf16"):
             loss, terms = self.network.loss(batch)
         if not torch.isfinite(loss):
             raise UsageError(
-                f"the loss became {float(loss)} at step {self.step}. The state saved last is "
-                "kept; train again with a lower --recipe.lr."
+                f"the loss became {float(loss.detach())} at step {self.step}. "
+                "The state saved last is kept; train again with a lower --recipe.lr."
             )
         loss.backward()
         return {name: float(term) for name, term in ({"loss": loss.detach()} | terms).items()}

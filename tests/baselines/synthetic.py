@@ -9,7 +9,7 @@ from torch import nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.text import TextSpec
+from baselines.text import TextSpec, Tokens, text_spec
 from sacil_tasks.interface import SCENE_BOUNDS, Keyframe, Observation
 from sacil_tasks.keyframes import Episode, KeyframeDemo, KeyframeMeta, write_keyframes
 
@@ -82,6 +82,18 @@ def observation(rng: np.random.Generator, step: int) -> Observation:
         step=step,
         max_steps=25,
     )
+
+
+class Letters:
+    """Stands in for the encoder `minilm`: a token a word, its letters counted."""
+
+    spec = text_spec("minilm")
+
+    def encode(self, sentence: str) -> Tokens:
+        tokens = np.zeros((len(sentence.split()), self.spec.dim), np.float16)
+        for row, word in enumerate(sentence.split()):
+            np.add.at(tokens[row], [ord(letter) for letter in word], 1)
+        return tokens
 
 
 @dataclass(frozen=True, kw_only=True)
