@@ -65,14 +65,12 @@ class EvalProtocol:
     image_pixels: int = IMAGE_PIXELS
     cameras: Mapping[str, CameraPlace] = field(
         default_factory=lambda: {
-            "front": CameraPlace(
-                eye_m=(0.75, 0.0, 0.72), target_m=(-0.06, 0.0, 0.09), fov_deg=36.0
-            ),
+            "front": CameraPlace(eye_m=(1.3, 0.0, 1.0), target_m=(-0.04, 0.0, 0.255), fov_deg=24.5),
             "left_shoulder": CameraPlace(
-                eye_m=(-0.42, 0.62, 0.85), target_m=(-0.075, 0.0, 0.06), fov_deg=38.0
+                eye_m=(-0.70, 0.95, 1.05), target_m=(-0.055, 0.0, 0.135), fov_deg=28.5
             ),
             "right_shoulder": CameraPlace(
-                eye_m=(-0.42, -0.62, 0.85), target_m=(-0.075, 0.0, 0.06), fov_deg=38.0
+                eye_m=(-0.70, -0.95, 1.05), target_m=(-0.055, 0.0, 0.135), fov_deg=28.5
             ),
         }
     )

@@ -230,4 +230,6 @@ def _report(job: Job, log: EpisodeLog) -> None:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(RunConfig, description=__doc__)))
+    run_command(
+        lambda: main(tyro.cli(RunConfig, prog="python -m leaderboard.run", description=__doc__))
+    )
