@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
+from jaxtyping import Bool, Float32
 
 from sacil_tasks.catalog import MAX_EPISODE_STEPS, env_id, suite_names, suite_tasks, task_spec
 from sacil_tasks.errors import UsageError
@@ -28,7 +30,6 @@ from sacil_tasks.keyframes import (
     seal,
     write_demo,
 )
-from sacil_tasks.recording import StateTree, Trajectory
 from sacil_tasks.workers import JobFailure
 
 REDRAW_STRIDE = 1_000_000
@@ -36,10 +37,28 @@ REDRAW_STRIDE = 1_000_000
 MAX_FAILURES = 10
 """Scenes tried for one demo before it is given up."""
 
-ENV_KWARGS = {"obs_mode": "none", "control_mode": "pd_joint_pos", "sim_backend": "physx_cpu"}
+ENV_KWARGS: Mapping[str, Any] = {
+    "obs_mode": "none",
+    "control_mode": "pd_joint_pos",
+    "sim_backend": "physx_cpu",
+}
 """How the environment is made for a demo and for its replay."""
 
 _PART_SCHEMA = 1
+
+
+StateTree = dict[str, Any]
+"""Nested dicts of arrays with the same structure as ManiSkill's `get_state_dict()`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """One episode, as ManiSkill's `RecordEpisode` stores it."""
+
+    actions: Float32[np.ndarray, "steps joints"]
+    success: Bool[np.ndarray, "steps"]
+    states: StateTree
+    """Leaves have one row more than there are actions: the first is the state after the reset."""
 
 
 @dataclass(frozen=True, kw_only=True)

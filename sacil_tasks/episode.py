@@ -7,7 +7,7 @@ canonical sizes, from the home pose. So which scene it is depends on no word, sp
 import hashlib
 import json
 import time
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,7 +63,7 @@ class Stage:
         self.task = task
         self.spec = task_spec(task)
         self.recorder = StepRecorder(_make(task, render=render))
-        self.env: SizedTableEnv = self.recorder.unwrapped
+        self.env: SizedTableEnv = self.recorder.unwrapped  # type: ignore[assignment]
         self.attempt = 0
         """Attempts of the running scene that were rejected, for the acceptance rate."""
         self.seed = 0
@@ -72,7 +72,7 @@ class Stage:
         """Reset options of the running episode."""
         self._executor = KeyframeExecutor(self.recorder)
         self._accepted: dict[SceneKey, int] = {}
-        self._seconds = Counter[str]()
+        self._seconds: dict[str, float] = defaultdict(float)
         self._steps = 0
         self._gripper_open = True
 
@@ -119,7 +119,7 @@ class Stage:
             self._gripper_open = keyframe.gripper_open
         state = self.env.evaluate()
         return StepResult(
-            refusal=refusal and refusal.reason,
+            refusal=None if refusal is None else refusal.reason,
             success=bool(state["success"]),
             success_lenient=bool(state["success_lenient"]),
         )
@@ -178,9 +178,8 @@ class Stage:
 
 def _make(task: str, *, render: bool) -> gym.Env:
     try:
-        return gym.make(
-            env_id(task), render_backend="cpu" if render else "none", **ENV_KWARGS
-        ).unwrapped
+        backend = "cpu" if render else "none"
+        return gym.make(env_id(task), render_backend=backend, **ENV_KWARGS).unwrapped
     except RuntimeError as error:
         raise UsageError(
             f"nothing here can render ({error}). `python -m sacil_tasks.doctor` says what to do."

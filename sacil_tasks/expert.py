@@ -4,10 +4,9 @@ from dataclasses import asdict
 
 import numpy as np
 
-from sacil_tasks.demos import MAX_FAILURES, DemoJob, ExpertFailure, save_part
+from sacil_tasks.demos import MAX_FAILURES, DemoJob, ExpertFailure, Trajectory, save_part
 from sacil_tasks.episode import SceneKey, Stage
 from sacil_tasks.keyframes import Episode, KeyframeDemo
-from sacil_tasks.recording import Trajectory
 
 
 class Demonstrator:

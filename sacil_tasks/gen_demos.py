@@ -35,6 +35,9 @@ from sacil_tasks.errors import UsageError, find_name, run_command
 from sacil_tasks.files import atomic_path
 from sacil_tasks.workers import JobFailure, run_jobs
 
+EXPERT = "sacil_tasks.expert:Demonstrator"
+"""What works in the worker processes; it imports the simulator."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GenConfig:
@@ -153,7 +156,7 @@ def finish(demos: DemoSet, count: int) -> None:
 def _unfinished(jobs: Sequence[DemoJob], workers: int, bar: tqdm) -> Iterator[DemoJob]:
     """Run all jobs once; yield those to be run again, as they should be run."""
     made, failed = 0, 0
-    with closing(run_jobs(jobs, "sacil_tasks.expert:Demonstrator", workers)) as results:
+    with closing(run_jobs(jobs, EXPERT, workers)) as results:
         for job, result in results:
             if isinstance(result, JobFailure):
                 bar.write(f"demo {job.index} of {job.demos.task}: {result.reason}", sys.stderr)

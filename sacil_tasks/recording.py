@@ -1,25 +1,13 @@
 """Control steps -> a trajectory in ManiSkill's terms: actions, states and success of each step."""
 
 import time
-from dataclasses import dataclass
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from jaxtyping import Bool, Float32
+from mani_skill.envs.sapien_env import BaseEnv
 
-StateTree = dict[str, Any]
-"""Nested dicts of arrays with the same structure as ManiSkill's `get_state_dict()`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trajectory:
-    """One episode, as ManiSkill's `RecordEpisode` stores it."""
-
-    actions: Float32[np.ndarray, "steps joints"]
-    success: Bool[np.ndarray, "steps"]
-    states: StateTree
-    """Leaves have one row more than there are actions: the first is the state after the reset."""
+from sacil_tasks.demos import StateTree, Trajectory
 
 
 class StepRecorder(gym.Wrapper):
@@ -31,6 +19,7 @@ class StepRecorder(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         """Record `env`; states only while `keep_states` is set."""
         super().__init__(env)
+        self._base: BaseEnv = env.unwrapped  # type: ignore[assignment]
         self.keep_states = False
         self.physics_s = 0.0
         """Seconds spent in `step` since construction."""
@@ -69,7 +58,7 @@ class StepRecorder(gym.Wrapper):
 
     def _note_state(self) -> None:
         if self.keep_states:
-            self._states.append(_to_numpy(self.env.unwrapped.get_state_dict()))
+            self._states.append(_to_numpy(self._base.get_state_dict()))
 
 
 def _to_numpy(tree: Any) -> Any:

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -45,7 +45,7 @@ class JobFailure:
 
 def run_jobs(
     jobs: Sequence[J], handler: HandlerFactory, workers: int, *, recycle_after: int | None = None
-) -> Iterator[tuple[J, Any | JobFailure]]:
+) -> Generator[tuple[J, Any | JobFailure], None, None]:
     """Yield `(job, result or JobFailure)` as jobs finish, in any order.
 
     `handler()` is called in each worker and gives the function that turns a job into a result.
