@@ -18,6 +18,7 @@ SOFT_SIGMA_BINS = 1.5
 """Width of the soft labels."""
 
 TIE = 1e-5
+"""Below this a component of a unit vector is rounding of 32-bit quaternions."""
 
 
 def quaternion_to_bins(quaternion_wxyz: Float[np.ndarray, "*b 4"]) -> Int[np.ndarray, "*b 3"]:
@@ -62,10 +63,11 @@ def multiply(
 def canonical_yaw(quaternion_wxyz: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 4"]:
     """The orientation or its twin, half a turn about the tool z axis: one rule for both, w >= 0.
 
-    Two parallel fingers cannot tell the twins apart, so labels use one of them. It is the one
-    whose tool x axis points towards base +x +z (towards base +y where that is a tie). For a
-    gripper that points down this is yaw in (-90, 90] degrees, and the choice does not flip when
-    such a gripper is tilted forwards until it is level.
+    Two parallel fingers cannot tell the twins apart, so labels use one of them (D-twins: RVT takes
+    what the demonstration happened to use): the one whose tool x axis points towards base +x +z,
+    or towards base +y where that is a tie. For a gripper that points down this is yaw in
+    (-90, 90] degrees, and the choice does not flip while such a gripper is tilted forwards until
+    it is level.
     """
     w, x, y, z = np.moveaxis(np.asarray(quaternion_wxyz), -1, 0)
     twin = np.stack([-z, y, -x, w], axis=-1)  # quaternion times (0, 0, 0, 1)

@@ -15,8 +15,6 @@ right   -x          h (1 - y)   h (1 - z)   1 + x
 Coordinates are continuous: pixel k covers [k, k + 1).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
@@ -46,14 +44,6 @@ DEPTH_SCALE = 2.0 ** (24 + INDEX_BITS)
 bits free for the index of the point, and the sum of both is exact in a float64."""
 
 NOTHING = np.inf
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewConfig:
-    """How large the virtual views are."""
-
-    pixels: int = 128
-    """Pixels per side; RVT and the paper use 220."""
 
 
 def cube_from_base(bounds: SceneBounds = SCENE_BOUNDS) -> Float32[np.ndarray, "3 4"]:
