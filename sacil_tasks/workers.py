@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Generic, TypeVar
@@ -58,9 +59,9 @@ def run_jobs(
     waiting = list(reversed(jobs))
     crew: list[_Worker[J]] = []
     try:
-        crew += [_Worker(handler) for _ in range(min(workers, len(jobs)))]
-        for worker in crew:
-            worker.give(waiting.pop())
+        for _ in range(min(workers, len(jobs))):
+            crew.append(_Worker(handler))
+            crew[-1].give(waiting.pop())
         while crew:
             worker = _first_ready(crew)
             job, result = worker.collect()
@@ -129,6 +130,8 @@ class _Worker(Generic[J]):
 
 def _start_deaf_to_ctrl_c(process: BaseProcess) -> None:
     # Ctrl-C is the parent's to handle. The child inherits the mask, so it is deaf from the start.
+    # The tracker unblocks Ctrl-C when it starts, which the first child would do otherwise.
+    resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process.start()

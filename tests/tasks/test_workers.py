@@ -93,14 +93,14 @@ def test_stopping_the_parent_stops_its_workers_at_once(tmp_path, monkeypatch, bl
         os.killpg(group.pid, blow)  # what a terminal does: everybody gets it
     else:
         group.send_signal(blow)
-    _, stderr = group.communicate(timeout=10)
+    _, stderr = group.communicate(timeout=30)
     assert _wait_for(lambda: [pid for pid in pids if not _running(pid)], count=2)
     assert "Traceback" not in stderr
     assert group.returncode == (130 if blow == signal.SIGINT else -signal.SIGKILL)
 
 
 def _wait_for(look: Callable[[], list[int]], count: int) -> list[int]:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while len(found := look()) < count:
         assert time.monotonic() < deadline, f"found only {found}"
         time.sleep(0.05)
