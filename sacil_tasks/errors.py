@@ -1,4 +1,4 @@
-"""What a user did that cannot work, said in one sentence, and look-ups that name the nearest match."""
+"""What cannot work, said in one sentence to the user, and look-ups that name the nearest match."""
 
 import difflib
 import sys
