@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor
 from torch import Tensor
