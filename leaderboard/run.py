@@ -13,7 +13,7 @@ import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, cast
 
@@ -27,7 +27,7 @@ from leaderboard.plan import SceneJob, plan_episodes, scene_jobs, whole_scenes
 from leaderboard.protocol import EvalProtocol, protocol_of
 from leaderboard.records import EpisodeKey, EpisodeLog, EpisodeRecord, doubts
 from leaderboard.summary import console_table, write_summary
-from leaderboard.worker import Choice, Doorkeeper, Look, Player
+from leaderboard.worker import Choice, Look, Player
 from sacil_tasks.catalog import suite_tasks, task_names
 from sacil_tasks.errors import UsageError, find_name, run_command
 from sacil_tasks.workers import JobFailure, run_jobs
@@ -112,6 +112,17 @@ def default_folder(config: RunConfig) -> Path:
     return Path("runs", "eval", name)
 
 
+def command_line(config: RunConfig) -> str:
+    """The command that asks for `config`, as a user would type it."""
+    words = ["python", "-m", "leaderboard.run"]
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if value != field.default:
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            words += [f"--{field.name}", *map(str, values)]
+    return shlex.join(words)
+
+
 def main(config: RunConfig) -> None:
     """Run what is missing, write the summary and print the table.
 
@@ -138,8 +149,14 @@ def main(config: RunConfig) -> None:
             videos = job.folder / VIDEO_FOLDER if config.video else None
             _run(Player(job.choice, entry, videos), missing, log, config.workers)
         else:
-            print(f"Nothing to do: all {len(job.keys)} episodes are in {job.folder}.")
+            hint = " To film them, choose another folder with --out." if config.video else ""
+            print(f"Nothing to do: all {len(job.keys)} episodes are in {job.folder}.{hint}")
         _report(job, log)
+    if ours.test_runs > 1:
+        print(
+            f"note: {ours.test_runs} folders beside and including this one hold test episodes of "
+            "these weights; numbers for a report come from one."
+        )
 
 
 def _announce(config: RunConfig, job: Job) -> None:
@@ -155,7 +172,7 @@ def _look(job: Job) -> Look:
     Raises:
         UsageError: the agent cannot be loaded.
     """
-    ((_, look),) = run_jobs([job.choice], Doorkeeper(), workers=1)
+    ((_, look),) = run_jobs([job.choice], "leaderboard.worker:looker", workers=1)
     if isinstance(look, JobFailure):
         raise UsageError(
             f"agent '{job.choice.agent.name}' failed while loading ({look.reason}); "
@@ -173,7 +190,7 @@ def _manifest(config: RunConfig, job: Job, entry: Entry) -> manifests.Manifest:
         scene_set=config.seed,
         splits=sorted(set(config.split)),
         protocols={task: protocol.described() for task, protocol in job.protocols.items()},
-        commands=[shlex.join(["python", "-m", "leaderboard.run", *sys.argv[1:]])],
+        commands=[command_line(config)],
         versions=manifests.installed_versions(),
     )
     return manifests.counted(job.folder, ours)

@@ -1,7 +1,8 @@
 """What child processes do: look at the agent once, then play one scene after another.
 
-Both are picklable callables for `sacil_tasks.workers.run_jobs`. Agents, torch and ManiSkill are
-imported only there, so that a crash at import is a sentence and the parent stays light.
+`looker` and `Player` are handler factories for `sacil_tasks.workers.run_jobs`. Agents, torch and
+ManiSkill are imported only in the children, so that a crash at import is a sentence and the parent
+stays light.
 """
 
 from collections.abc import Callable
@@ -33,15 +34,6 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Doorkeeper:
-    """Loads the agent once before any simulator starts: a bad checkpoint ends the run here."""
-
-    def __call__(self) -> Callable[[Choice], Look]:
-        """The handler of a choice."""
-        return look_at
-
-
-@dataclass(frozen=True)
 class Player:
     """Plays the episodes of scenes."""
 
@@ -60,6 +52,11 @@ class Player:
 
         policy = self.choice.agent.load(checkpoint=self.choice.checkpoint, tasks=self.choice.tasks)
         return SceneRunner(policy, self.entry, self.videos).play
+
+
+def looker() -> Callable[[Choice], Look]:
+    """Handler of the one job before any simulator starts: a bad checkpoint ends the run there."""
+    return look_at
 
 
 def look_at(choice: Choice) -> Look:

@@ -1,11 +1,13 @@
 import json
+import shlex
 from pathlib import Path
 
 import pytest
+import tyro
 
 from leaderboard import manifest as manifests
 from leaderboard.records import EPISODES_FILE
-from leaderboard.run import Job, RunConfig, default_folder, main
+from leaderboard.run import Job, RunConfig, command_line, default_folder, main
 from sacil_tasks.errors import UsageError
 
 
@@ -39,6 +41,19 @@ def test_the_default_folder_tells_agents_weights_and_scenes_apart():
     ]
     assert len({default_folder(config) for config in configs}) == len(configs)
     assert default_folder(RunConfig(agent="rvt", episodes=102)) == default_folder(configs[0])
+
+
+def test_the_stored_command_asks_for_the_same_run():
+    config = RunConfig(
+        agent="rvt",
+        tasks=("pick_and_lift", "push_buttons"),
+        episodes=6,
+        out=Path("a b"),
+        video=True,
+    )
+    words = shlex.split(command_line(config))
+    assert words[:3] == ["python", "-m", "leaderboard.run"]
+    assert tyro.cli(RunConfig, args=words[3:]) == config
 
 
 def manifest(**changes) -> manifests.Manifest:
