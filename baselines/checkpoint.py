@@ -185,9 +185,11 @@ def export_release(run: Path, target: Path) -> None:
     """Copy the checkpoint of a finished run in half precision, without its training state.
 
     Raises:
-        UsageError: `run` holds no readable checkpoint, or `target` cannot be written.
+        UsageError: `run` holds no finished checkpoint, or `target` cannot be written.
     """
     identity = Identity.load(run)
+    if not _read_json(run / PROVENANCE).get("complete"):
+        raise UsageError(f"the run in {run} is not finished. Complete it with --resume first.")
     with _readable(run / MODEL):
         weights = load_file(run / MODEL)
     identity.save(target)

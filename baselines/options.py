@@ -68,13 +68,15 @@ class TrainConfig:
         """Reject contradictions.
 
         Raises:
-            UsageError: says which flags exclude each other.
+            UsageError: says which flags exclude each other, or which values they may have.
         """
         budgets = [self.minutes, self.steps, self.samples]
         if sum(budget is not None for budget in budgets) > 1:
             raise UsageError("--minutes, --steps and --samples exclude each other; give one.")
         if any(budget is not None and budget <= 0 for budget in budgets):
             raise UsageError("--minutes, --steps and --samples must be above 0.")
+        if self.threads < 1 or self.seed < 0 or self.validate_every < 0:
+            raise UsageError("--threads must be above 0, --seed and --validate-every not below 0.")
         if self.suite is not None and self.tasks:
             raise UsageError("--suite and --tasks exclude each other; give one.")
 

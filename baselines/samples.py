@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sacil_tasks.errors import UsageError
-from sacil_tasks.interface import MAX_KEYFRAMES, Observation
+from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
 from sacil_tasks.keyframes import OBSERVATION_COLUMNS, Episode, KeyframeFile
 
 STREAMS = ("rows", "moves", "goals", "noise", "torch")
@@ -51,12 +51,13 @@ class Shard:
         """Read a whole keyframe file.
 
         Raises:
-            UsageError: missing, truncated or foreign file.
+            UsageError: missing, truncated or foreign file, or a keyframe outside the render cube.
         """
         with KeyframeFile.open(path) as file:
             columns = {name: file.column(name) for name in OBSERVATION_COLUMNS}
             task, sha256 = file.meta.task, file.content_sha256
             episodes, first_rows = file.episodes, file.first_rows
+        _check_in_cube(path, columns["keyframe_in_base"][:, :3])
         return cls(task, path, sha256, episodes, first_rows, columns)
 
     def __len__(self) -> int:
@@ -150,7 +151,8 @@ class KeyframeSet:
         """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
 
         A draw without two sizes of one task is repeated: such a batch would let a contrast be
-        solved by task identity.
+        solved by task identity (D-two-sizes). RVT draws keyframes uniformly within a task and
+        repeats late ones for every earlier frame (D-demo-uniform).
 
         Raises:
             UsageError: no task has demos of two sizes.
@@ -177,6 +179,17 @@ class KeyframeSet:
                 "every task has demos of a single size only, so nothing about size can be learnt. "
                 + _gen_demos(*self.tasks)
             )
+
+
+def _check_in_cube(path: Path, targets_in_base: Float32[np.ndarray, "m 3"]) -> None:
+    """A target outside the cube is in no view, so nothing could learn it."""
+    half = SCENE_BOUNDS.side_m / 2
+    outside = np.abs(targets_in_base - SCENE_BOUNDS.center_in_base) > half  # False where NaN
+    if outside.any():
+        raise UsageError(
+            f"{path}: {outside.any(1).sum()} keyframes lie outside the cube that is rendered "
+            f"({SCENE_BOUNDS}). Move the task into it."
+        )
 
 
 def _gen_demos(*tasks: str) -> str:

@@ -4,7 +4,6 @@
 run is begun, or found in its folder and completed.
 """
 
-import importlib.metadata
 import json
 import logging
 import statistics
@@ -16,12 +15,11 @@ from typing import Any
 
 import torch
 
-from baselines.checkpoint import METRICS, PROVENANCE, TEXT, TrainState
+from baselines.checkpoint import METRICS, TEXT, TrainState
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
 from baselines.trainer import Run, read_rows
 from sacil_tasks.errors import UsageError, run_command
-from sacil_tasks.files import write_json
 
 CALIBRATION_STEPS = 8
 """Steps that are timed for `--minutes`; the first two, which compile, are left out."""
@@ -44,7 +42,6 @@ def main(job: Job) -> None:
     material = Material.load(job)
     run = _begin(material) if state is None else _continue(material, state)
     run.finish(validate_every=options.validate_every)
-    _write_provenance(run)
     _report(options.folder)
 
 
@@ -52,6 +49,7 @@ def _begin(material: Material) -> Run:
     """Fix the number of steps and write what does not change during the run."""
     job, folder = material.job, material.job.options.folder
     steps = _steps(material)
+    (folder / METRICS).unlink(missing_ok=True)
     job = Job(job.options, with_samples(job.config, steps * job.config.recipe.batch))
     material = replace(material, job=job, identity=replace(material.identity, config=job.config))
     material.identity.save(folder)
@@ -60,7 +58,6 @@ def _begin(material: Material) -> Run:
     data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
     plan = {"steps": steps, "request": _request(job), "keyframes": data}
     run = Run(material.trainer(steps), folder, plan, validate=material.validator())
-    _write_provenance(run)
     run.save()
     return run
 
@@ -116,7 +113,8 @@ def _request(job: Job) -> dict[str, Any]:
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
     if not isinstance(tree, dict):
         return {prefix: tree}
-    return {k: v for name in tree for k, v in _flat(tree[name], f"{prefix}.{name}").items()}
+    nested = (_flat(branch, f"{prefix}.{name}") for name, branch in tree.items())
+    return {name.lstrip("."): leaf for branch in nested for name, leaf in branch.items()}
 
 
 def _steps(material: Material) -> int:
@@ -134,33 +132,6 @@ def _steps(material: Material) -> int:
     steps = max(1, round(60 * options.minutes / pace))
     print(f"{pace:.2f} s a step: {options.minutes:g} minutes are {steps} steps.")
     return steps
-
-
-def _write_provenance(run: Run) -> None:
-    trainer, request = run.trainer, run.plan["request"]
-    config = request["config"]
-    provenance = {
-        "agent": request["agent"],
-        "preset": request["preset"],
-        "seed": request["seed"],
-        "text": config["recipe"]["text"],
-        "steps": trainer.step,
-        "samples": trainer.step * trainer.recipe.batch,
-        "complete": trainer.step == trainer.steps,
-        "wall_minutes": round(run.wall_s / 60, 2),
-        "core_minutes": round(run.cpu_s / 60, 2),
-        "keyframes_sha256": run.plan["keyframes"],
-        "code_version": _code_version(),
-        "torch": torch.__version__,
-    }
-    write_json(run.folder / PROVENANCE, provenance)
-
-
-def _code_version() -> str:
-    try:
-        return importlib.metadata.version("sacil")
-    except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
-        return "unknown"
 
 
 def _report(folder: Path) -> None:

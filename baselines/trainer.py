@@ -4,7 +4,9 @@ A step is a function of (seed, step) and of the state before it, so a run that w
 resumed ends in the same bits as an unbroken one.
 """
 
+import importlib.metadata
 import json
+import logging
 import math
 import signal
 import time
@@ -22,12 +24,14 @@ from tqdm import tqdm
 
 from baselines.agent import Network, Recipe
 from baselines.batch import Batch
-from baselines.checkpoint import METRICS, TrainState, save_weights
+from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
 from baselines.loader import Loader
 from baselines.optim import Ema, Lamb, TensorTable, copy_into, learning_rate
 from baselines.samples import stream
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path
+from sacil_tasks.files import atomic_path, write_json
+
+log = logging.getLogger(__name__)
 
 LOG_EVERY = 50
 """Steps of one line of `metrics.jsonl`."""
@@ -184,8 +188,13 @@ class Run:
         trim_metrics(self.folder / METRICS, state.step)
 
     def save(self) -> None:
-        """Save the state, then the weights to evaluate; a kill in between loses nothing."""
+        """Save the weights to evaluate and what is behind them, then the state.
+
+        The state comes last: a run that says it is complete has its final weights.
+        """
         trainer = self.trainer
+        save_weights(self.folder, trainer.averaged)
+        write_json(self.folder / PROVENANCE, self._provenance())
         TrainState(
             tensors=trainer.state(),
             step=trainer.step,
@@ -193,7 +202,6 @@ class Run:
             wall_s=self.wall_s,
             cpu_s=self.cpu_s,
         ).save(self.folder)
-        save_weights(self.folder, trainer.averaged)
 
     def finish(self, *, validate_every: int) -> None:
         """Train to the last step.
@@ -221,6 +229,12 @@ class Run:
                         self.save()
                         saved = time.monotonic()
         if stopped:
+            log.info(
+                "saved step %d of %d in %s: the same command with --resume goes on",
+                trainer.step,
+                trainer.steps,
+                self.folder,
+            )
             raise KeyboardInterrupt
 
     def _advance(self) -> None:
@@ -228,6 +242,23 @@ class Run:
         self._means.add(self.trainer.advance())
         self.wall_s += time.perf_counter() - wall
         self.cpu_s += time.process_time() - cpu
+
+    def _provenance(self) -> Row:
+        trainer, request = self.trainer, self.plan["request"]
+        return {
+            "agent": request["agent"],
+            "preset": request["preset"],
+            "seed": request["seed"],
+            "text": request["config"]["recipe"]["text"],
+            "steps": trainer.step,
+            "samples": trainer.step * trainer.recipe.batch,
+            "complete": trainer.step == trainer.steps,
+            "wall_minutes": round(self.wall_s / 60, 2),
+            "core_minutes": round(self.cpu_s / 60, 2),
+            "keyframes_sha256": self.plan["keyframes"],
+            "code_version": _code_version(),
+            "torch": torch.__version__,
+        }
 
     def _log(self) -> float:
         means = self._means.take()
@@ -250,6 +281,13 @@ class Run:
         network.load_state_dict(raw)
         network.train()
         append_row(self.folder / METRICS, row)
+
+
+def _code_version() -> str:
+    try:
+        return importlib.metadata.version("sacil")
+    except importlib.metadata.PackageNotFoundError:  # a checkout that is not installed
+        return "unknown"
 
 
 def append_row(path: Path, row: Row) -> None:

@@ -37,7 +37,7 @@ def folder(tmp_path, identity):
     save_weights(path, identity)
     known = {"lift it": np.ones((3, 8), np.float16)}
     SentenceTable(TEXT_SPEC, known).save(path / TEXT, known)
-    (path / PROVENANCE).write_text('{"steps": 5}')
+    (path / PROVENANCE).write_text('{"complete": true}')
     TrainState(tensors={}, step=5, plan={}, wall_s=0, cpu_s=0).save(path)
     return path
 
@@ -159,6 +159,13 @@ def test_a_release_is_half_as_large_and_loads_alone(folder, tmp_path):
     loaded = checkpoint.load(target, agent="tiny").network.state_dict()
     for name, tensor in loaded.items():
         assert torch.equal(tensor, full[name].half().float())
+
+
+def test_an_unfinished_run_is_not_released(folder, tmp_path):
+    (folder / PROVENANCE).write_text('{"complete": false}')
+    with pytest.raises(UsageError, match="not finished"):
+        checkpoint.export_release(folder, tmp_path / "released")
+    assert not (tmp_path / "released").exists()
 
 
 def test_the_hash_names_weights_and_config(folder, identity):

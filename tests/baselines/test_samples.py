@@ -182,3 +182,11 @@ def test_a_damaged_file_is_named(tmp_path, damage):
         h5py.File(path, "w").close()
     with pytest.raises(UsageError, match=r"pick_and_lift\.h5"):
         Shard.load(path)
+
+
+def test_a_keyframe_outside_the_render_cube_is_refused(tmp_path):
+    path = synthetic.write_file(tmp_path, "pick_and_lift", demos=2)
+    with h5py.File(path, "r+") as file:
+        file["observations/keyframe_in_base"][1, 1] = 0.5
+    with pytest.raises(UsageError, match="1 keyframes lie outside the cube"):
+        Shard.load(path)

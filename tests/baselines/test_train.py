@@ -245,9 +245,7 @@ def test_missing_data_and_unknown_names_are_refused_before_anything_is_written(t
     out = tmp_path / "run"
     with pytest.raises(UsageError, match="gen_demos --tasks pick_and_lift pick_up_cup"):
         train(tmp_path, out)
-    with pytest.raises(
-        UsageError, match=r"no task called 'pick_and_lft'\. Did you mean pick"
-    ):
+    with pytest.raises(UsageError, match=r"no task called 'pick_and_lft'\. Did you mean pick"):
         main(parse(["--agent", "tiny", "--tasks", "pick_and_lft", "--out", str(out)]))
     with pytest.raises(UsageError, match="no suite called 'slyce'"):
         main(parse(["--agent", "tiny", "--suite", "slyce", "--out", str(out)]))
