@@ -11,9 +11,10 @@ from baselines.agent import find_agent
 from baselines.checkpoint import Identity
 from baselines.loader import Loader
 from baselines.options import Job
+from baselines.run import Validator
 from baselines.samples import KeyframeSet
 from baselines.text import SentenceTable, cached_table
-from baselines.trainer import Trainer, Validator
+from baselines.trainer import Trainer
 from baselines.validate import validate
 from sacil_tasks.catalog import task_spec
 from sacil_tasks.instructions import official_sentences

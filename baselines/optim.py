@@ -25,9 +25,9 @@ class Lamb:
     def __init__(self, network: nn.Module, *, weight_decay: float) -> None:
         """Optimise all trainable parameters of `network`."""
         self.weight_decay = weight_decay
-        self._parameters = {n: p for n, p in network.named_parameters() if p.requires_grad}
-        self.mean = {n: torch.zeros_like(p) for n, p in self._parameters.items()}
-        self.square = {n: torch.zeros_like(p) for n, p in self._parameters.items()}
+        self.parameters = {n: p for n, p in network.named_parameters() if p.requires_grad}
+        self.mean = {n: torch.zeros_like(p) for n, p in self.parameters.items()}
+        self.square = {n: torch.zeros_like(p) for n, p in self.parameters.items()}
 
     @torch.no_grad()
     def step(self, lr: float) -> None:
@@ -37,7 +37,7 @@ class Lamb:
         """
         # One tensor at a time: its eight passes then stay in the cache, which on one core beats
         # torch's foreach kernels (one pass over all tensors after another).
-        for name, weight in self._parameters.items():
+        for name, weight in self.parameters.items():
             if weight.grad is not None:
                 update = self._update(name, weight, weight.grad)
                 weight.add_(update, alpha=-lr * self._trust_ratio(weight, update))

@@ -1,7 +1,7 @@
 """Train an agent on keyframe files: `python -m baselines.train --agent rvt`.
 
-`options.py` reads the command line, `material.py` the data, `trainer.py` takes the steps; here a
-run is begun, or found in its folder and completed.
+`options.py` reads the command line, `material.py` the data, `trainer.py` takes the steps, `run.py`
+keeps their record; here a run is begun, or found in its folder and completed.
 """
 
 import json
@@ -18,7 +18,7 @@ import torch
 from baselines.checkpoint import METRICS, TEXT, TrainState
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
-from baselines.trainer import Run, read_rows
+from baselines.run import Run, read_rows
 from sacil_tasks.errors import UsageError, run_command
 
 CALIBRATION_STEPS = 8

@@ -11,11 +11,11 @@ import pytest
 import synthetic
 import torch
 
-from baselines import agent, trainer
-from baselines.checkpoint import CONFIG, METRICS, MODEL, PROVENANCE, STATE, load
+from baselines import agent, run, trainer
+from baselines.checkpoint import CONFIG, METRICS, MODEL, PROVENANCE, STATE, TrainState, load
 from baselines.options import parse
+from baselines.run import Means, read_rows
 from baselines.train import main
-from baselines.trainer import Means, read_rows
 from sacil_tasks.errors import UsageError
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -26,8 +26,8 @@ TIMING = ("samples_per_s", "cpu_s", "share_loading", "share_network", "share_opt
 @pytest.fixture(autouse=True)
 def log_often(monkeypatch):
     """Every second step is logged and saved, so that short runs have something to resume."""
-    monkeypatch.setattr(trainer, "LOG_EVERY", 2)
-    monkeypatch.setattr(trainer, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(run, "LOG_EVERY", 2)
+    monkeypatch.setattr(run, "SAVE_EVERY_S", 0.0)
 
 
 def command(data, out, *flags, name="tiny:goals"):
@@ -62,7 +62,7 @@ def unbroken(data, tmp_path_factory):
     """A run of twelve steps that nothing stopped."""
     out = tmp_path_factory.mktemp("runs") / "unbroken"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "LOG_EVERY", 2)
+        patch.setattr(run, "LOG_EVERY", 2)
         known = {**agent.agent_modules(), "tiny": "synthetic"}
         patch.setattr("baselines.agent.agent_modules", lambda: known)
         torch.set_num_threads(1)
@@ -129,10 +129,10 @@ def test_kill_9_in_a_real_process_loses_nothing(data, tmp_path, unbroken):
     here = Path(__file__).parent
     script = (
         "import sys\n"
-        "from baselines import agent, trainer\n"
+        "from baselines import agent, run, trainer\n"
         "known = {**agent.agent_modules(), 'tiny': 'synthetic'}\n"
         "agent.agent_modules = lambda: known\n"
-        "trainer.LOG_EVERY, trainer.SAVE_EVERY_S = 2, 0.0\n"
+        "run.LOG_EVERY, run.SAVE_EVERY_S = 2, 0.0\n"
         "from baselines.options import parse\n"
         "from baselines.train import main\n"
         "main(parse(sys.argv[1:]))\n"
@@ -193,10 +193,24 @@ def test_a_loss_that_is_not_finite_keeps_the_last_good_state(data, tmp_path, mon
 
     diverge.step = 0
     monkeypatch.setattr(synthetic.Tiny, "loss", diverge)
-    with pytest.raises(UsageError, match=r"nan at step 5.*lower --recipe\.lr"):
+    with pytest.raises(UsageError, match=r"no longer finite at step 5.*lower --recipe\.lr"):
         train(data, tmp_path / "run", "--steps", "12")
     weights = load(tmp_path / "run", agent="tiny:goals").network.state_dict()
     assert all(tensor.isfinite().all() for tensor in weights.values())
+
+
+def test_weights_that_a_step_has_spoilt_are_not_saved(data, tmp_path, monkeypatch):
+    def spoil(optimiser, lr):
+        spoil.step += 1
+        if spoil.step == 4:  # step 4 is saved, its loss was still finite
+            with torch.no_grad():
+                optimiser.parameters["position.weight"].fill_(torch.inf)
+
+    spoil.step = 0
+    monkeypatch.setattr(trainer.Lamb, "step", spoil)
+    with pytest.raises(UsageError, match="a weight is no longer finite at step 4"):
+        train(data, tmp_path / "run", "--steps", "12")
+    assert TrainState.load(tmp_path / "run").step == 2
 
 
 def test_minutes_become_steps_that_are_kept(data, tmp_path, capsys):
@@ -209,8 +223,8 @@ def test_minutes_become_steps_that_are_kept(data, tmp_path, capsys):
 
 
 def test_training_lowers_the_loss(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "SAVE_EVERY_S", 60.0)
-    train(data, tmp_path / "run", "--steps", "80", "--recipe.lr", "0.05", "--validate-every", "0")
+    monkeypatch.setattr(run, "SAVE_EVERY_S", 60.0)
+    train(data, tmp_path / "run", "--steps", "40", "--recipe.lr", "0.1", "--validate-every", "0")
     losses = [row["loss"] for row in read_rows(tmp_path / "run" / METRICS)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 

@@ -1,0 +1,239 @@
+"""A training run in its folder: steps, log, validation, saves, a clean stop."""
+
+import importlib.metadata
+import json
+import logging
+import math
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, TypeAlias
+
+import torch
+from tqdm import tqdm
+
+from baselines.agent import Network
+from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
+from baselines.trainer import Trainer
+from sacil_tasks.errors import UsageError
+from sacil_tasks.files import atomic_path, write_json
+
+log = logging.getLogger(__name__)
+
+LOG_EVERY = 50
+"""Steps of one line of `metrics.jsonl`."""
+
+SAVE_EVERY_S = 60.0
+"""Seconds of work a kill may cost."""
+
+Row: TypeAlias = dict[str, Any]
+Validator: TypeAlias = Callable[[Network], Row]
+
+
+@dataclass
+class Means:
+    """Averages of named scalars, each over the steps on which it existed (was not NaN)."""
+
+    sums: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    def add(self, values: Mapping[str, float]) -> None:
+        """Take in one step's values."""
+        for name, value in values.items():
+            if not math.isnan(value):
+                self.sums[name] += value
+                self.counts[name] += 1
+
+    def take(self) -> dict[str, float]:
+        """The averages so far; starts again at nothing."""
+        means = {name: total / self.counts[name] for name, total in self.sums.items()}
+        self.sums.clear()
+        self.counts.clear()
+        return means
+
+
+class Run:
+    """A trainer and its folder: carries a run to its end, or as far as it is let."""
+
+    def __init__(
+        self, trainer: Trainer, folder: Path, plan: Mapping[str, Any], *, validate: Validator | None
+    ) -> None:
+        """`plan` is what a resumed run must agree with; `validate` gives a row of metrics."""
+        self.trainer = trainer
+        self.folder = folder
+        self.plan = plan
+        self.wall_s = 0.0
+        self.cpu_s = 0.0
+        self._validate = validate
+        self._means = Means()
+
+    def resume(self, state: TrainState) -> None:
+        """Take over from a saved state, and forget metrics that were logged after it.
+
+        Raises:
+            UsageError: the state is one of another network.
+        """
+        try:
+            self.trainer.restore(state.tensors, state.step)
+        except (KeyError, RuntimeError) as error:
+            raise UsageError(
+                f"{self.folder} holds the state of another network. Choose another --out."
+            ) from error
+        self.wall_s, self.cpu_s = state.wall_s, state.cpu_s
+        trim_metrics(self.folder / METRICS, state.step)
+
+    def save(self) -> None:
+        """Save the weights to evaluate and what is behind them, then the state.
+
+        The state comes last: a run that says it is complete has its final weights.
+
+        Raises:
+            UsageError: a weight is not finite, or the folder cannot be written.
+        """
+        trainer = self.trainer
+        trainer.check_finite()
+        save_weights(self.folder, trainer.averaged)
+        write_json(self.folder / PROVENANCE, self._provenance())
+        TrainState(
+            tensors=trainer.state(),
+            step=trainer.step,
+            plan=self.plan,
+            wall_s=self.wall_s,
+            cpu_s=self.cpu_s,
+        ).save(self.folder)
+
+    def finish(self, *, validate_every: int) -> None:
+        """Train to the last step.
+
+        Raises:
+            KeyboardInterrupt: stopped by a signal, after saving.
+            UsageError: loss or weights are not finite, or the folder cannot be written.
+        """
+        trainer, saved = self.trainer, time.monotonic()
+        bar = tqdm(
+            initial=trainer.step, total=trainer.steps, unit="step", mininterval=1.0, disable=None
+        )
+        done = trainer.step == trainer.steps
+        with bar, deferred_signals() as stopped:
+            while not (done or stopped):
+                self._advance()
+                bar.update()
+                done = trainer.step == trainer.steps
+                if validate_every and (done or trainer.step % validate_every == 0):
+                    self._log_validation()
+                # State is saved only where a line is logged, so that the lines of a killed and
+                # resumed run are those of an unbroken one.
+                if done or stopped or trainer.step % LOG_EVERY == 0:
+                    bar.set_postfix(loss=f"{self._log():.3f}")
+                    if done or stopped or time.monotonic() - saved > SAVE_EVERY_S:
+                        self.save()
+                        saved = time.monotonic()
+        if stopped and not done:
+            log.info(
+                "saved step %d of %d in %s: the same command with --resume goes on",
+                trainer.step,
+                trainer.steps,
+                self.folder,
+            )
+            raise KeyboardInterrupt
+
+    def _advance(self) -> None:
+        wall, cpu = time.perf_counter(), time.process_time()
+        self._means.add(self.trainer.advance())
+        self.wall_s += time.perf_counter() - wall
+        self.cpu_s += time.process_time() - cpu
+
+    def _provenance(self) -> Row:
+        trainer, request = self.trainer, self.plan["request"]
+        return {
+            "agent": request["agent"],
+            "preset": request["preset"],
+            "seed": request["seed"],
+            "text": request["config"]["recipe"]["text"],
+            "steps": trainer.step,
+            "samples": trainer.step * trainer.recipe.batch,
+            "complete": trainer.step == trainer.steps,
+            "wall_minutes": round(self.wall_s / 60, 2),
+            "core_minutes": round(self.cpu_s / 60, 2),
+            "keyframes_sha256": self.plan["keyframes"],
+            "code_version": _code_version(),
+            "torch": torch.__version__,
+        }
+
+    def _log(self) -> float:
+        means = self._means.take()
+        parts = {name: means.pop(name) for name in list(means) if name.startswith("seconds_")}
+        total = sum(parts.values())
+        shares = {n.replace("seconds", "share"): round(s / total, 4) for n, s in parts.items()}
+        row = {"kind": "train", "step": self.trainer.step, "lr": self.trainer.lr, **means}
+        pace = round(self.trainer.recipe.batch / total, 2)
+        timing = {"samples_per_s": pace, "cpu_s": round(self.cpu_s, 1)}
+        append_row(self.folder / METRICS, row | timing | shares)
+        return means["loss"]
+
+    def _log_validation(self) -> None:
+        if self._validate is None:
+            return
+        network = self.trainer.network
+        raw = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        network.load_state_dict(self.trainer.averaged)
+        row = {"kind": "val", "step": self.trainer.step, **self._validate(network.eval())}
+        network.load_state_dict(raw)
+        network.train()
+        append_row(self.folder / METRICS, row)
+
+
+def _code_version() -> str:
+    try:
+        return importlib.metadata.version("sacil")
+    except importlib.metadata.PackageNotFoundError:  # a checkout that is not installed
+        return "unknown"
+
+
+def append_row(path: Path, row: Row) -> None:
+    """Append one line of JSON."""
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def read_rows(path: Path) -> list[Row]:
+    """All whole lines of a metrics file; a line cut off by a kill is left out."""
+    if not path.is_file():
+        return []
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def trim_metrics(path: Path, step: int) -> None:
+    """Drop what was logged after `step`; a resumed run logs it again."""
+    rows = [row for row in read_rows(path) if row["step"] <= step]
+    with atomic_path(path) as draft:
+        draft.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+@contextmanager
+def deferred_signals() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of raising in the middle of a step; the second raises."""
+    received: list[int] = []
+
+    def receive(number: int, _: FrameType | None) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    before = {number: signal.signal(number, receive) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
