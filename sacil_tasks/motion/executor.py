@@ -23,14 +23,11 @@ from sacil_tasks.motion.shapes import to_se3
 class ExecutorConfig:
     """When a motion counts as finished."""
 
-    settle_steps: int = 10
-    """Control steps the arm is waited for at most, after its last target."""
+    hold_steps: int = 10
+    """Control steps that arm or fingers are waited for at most after their last target."""
 
-    gripper_steps: int = 10
-    """Control steps the fingers are waited for at most."""
-
-    still_rad_s: float = 0.01
-    """Joints slower than this stand still (fingers: m/s, a tenth of it)."""
+    still: float = 5e-4
+    """All stands still if no joint moves more in a control step (rad; fingers: m)."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,8 @@ class Plan:
     path: Path
     """Waypoints; collision-free between them."""
 
-    targets: Path
-    """One joint target per control step."""
+    motion: Path
+    """Where the joints should be after each control step."""
 
 
 class KeyframeExecutor:
@@ -89,11 +86,12 @@ class KeyframeExecutor:
         plan = self.plan(keyframe)
         if isinstance(plan, Refusal):
             return plan
-        for target in plan.targets:
+        for target in self._without_lag(plan.motion):
             self._step(target)
-        self._settle(plan.targets[-1])
+        self._hold(plan.motion[-1])
         if keyframe.gripper_open != self._gripper_open:
-            self._move_gripper(plan.targets[-1], gripper_open=keyframe.gripper_open)
+            self._gripper_open = keyframe.gripper_open
+            self._hold(plan.motion[-1])
         return None
 
     def plan_sequence(self, keyframes: Sequence[Keyframe]) -> Refusal | None:
@@ -146,17 +144,24 @@ class KeyframeExecutor:
             return state
         return replace(state, held=self._world.body_between_fingers(state))
 
-    def _settle(self, target: Joints) -> None:
-        for _ in range(self._config.settle_steps):
-            self._step(target)
-            if self._speeds()[:ARM_JOINTS].max() < self._config.still_rad_s:
-                return
+    def _without_lag(self, motion: Path) -> Path:
+        """Targets that make the joints be where they should be after each control step.
 
-    def _move_gripper(self, target: Joints, *, gripper_open: bool) -> None:
-        self._gripper_open = gripper_open
-        for _ in range(self._config.gripper_steps):
+        The PD controller follows a target like a first-order lag of damping / stiffness
+        seconds; left alone, the arm would trail by up to 0.12 rad and leave the checked path.
+        """
+        agent = self._base.agent
+        lag_steps = agent.arm_damping / agent.arm_stiffness * self._base.control_freq
+        before = np.concatenate([self._joints()[None], motion[:-1]])
+        targets = before + (motion - before) / (1 - np.exp(-1 / lag_steps))
+        return np.clip(targets, self._arm.lower, self._arm.upper)
+
+    def _hold(self, target: Joints) -> None:
+        """Keep the last target until arm and fingers stand still."""
+        for _ in range(self._config.hold_steps):
+            before = self._positions()
             self._step(target)
-            if self._speeds()[ARM_JOINTS:].max() < self._config.still_rad_s / 10:
+            if np.abs(self._positions() - before).max() < self._config.still:
                 return
 
     def _step(self, target: Joints) -> None:
@@ -171,9 +176,6 @@ class KeyframeExecutor:
 
     def _positions(self) -> Float64[np.ndarray, "9"]:
         return self._base.agent.robot.get_qpos()[0].numpy().astype(float)
-
-    def _speeds(self) -> Float64[np.ndarray, "9"]:
-        return np.abs(self._base.agent.robot.get_qvel()[0].numpy().astype(float))
 
 
 def _to_pose(keyframe: Keyframe) -> pin.SE3 | Refusal:
