@@ -153,8 +153,13 @@ class ActionDecoder(nn.Module):
 
 
 def positions(config: MultiViewConfig, channels: int) -> nn.Parameter:
-    """A learned embedding of every token's place, N(0, 1) at first as in RVT."""
-    return nn.Parameter(torch.randn(1, len(VIEWS) * config.grid**2, channels))
+    """A learned embedding of every token's place.
+
+    Wide at first, N(0, 1), as in RVT beside its patch stem; small beside the pyramid, where it
+    would drown what the convolutions found (D-position).
+    """
+    spread = 1.0 if config.stem == "patch" else 0.02
+    return nn.Parameter(spread * torch.randn(1, len(VIEWS) * config.grid**2, channels))
 
 
 def blocks(count: int, config: MultiViewConfig) -> nn.ModuleList:
