@@ -24,16 +24,20 @@ def _made(task: str, **kwargs: Any) -> gym.Env:
     return gym.make(env_id(task), **{"obs_mode": "none", "render_backend": "cpu"} | kwargs)
 
 
-@pytest.fixture(scope="module", params=task_names())
-def env(request: pytest.FixtureRequest) -> Iterator[SizedTableEnv]:
-    made = _made(request.param)
+@pytest.fixture(scope="module", autouse=True)
+def blocks() -> Iterator[SizedTableEnv]:
+    """Alive throughout: shaders are compiled again after the last environment has closed."""
+    made = _made("pick_and_lift")
     yield made.unwrapped  # type: ignore[misc]
     made.close()
 
 
-@pytest.fixture(scope="module")
-def blocks() -> Iterator[SizedTableEnv]:
-    made = _made("pick_and_lift")
+@pytest.fixture(scope="module", params=task_names())
+def env(request: pytest.FixtureRequest, blocks: SizedTableEnv) -> Iterator[SizedTableEnv]:
+    if request.param == "pick_and_lift":
+        yield blocks
+        return
+    made = _made(request.param)
     yield made.unwrapped  # type: ignore[misc]
     made.close()
 
@@ -103,7 +107,7 @@ def test_unprojected_table_is_flat_at_zero(blocks: SizedTableEnv, view: int) -> 
     table = heights[np.abs(heights) < 0.01]
     assert table.size > IMAGE_PIXELS**2 // 3
     assert abs(np.median(table)) < 5e-4
-    assert np.abs(table).max() < 3e-3
+    assert np.quantile(np.abs(table), 0.95) < 2e-3  # the rest are feet of blocks
 
 
 def _pixels_by_label(env: SizedTableEnv, seed: int, split: str) -> np.ndarray:
