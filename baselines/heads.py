@@ -42,7 +42,9 @@ def read_at(
     mass = heat.detach().float().flatten(1).softmax(-1).view_as(heat)
     share = heat.shape[-1] // features.shape[-1]
     weights = functional.avg_pool2d(mass, share, divisor_override=1) if share > 1 else mass
-    return torch.einsum("n p, n c p -> n c", weights.flatten(1), features.float().flatten(2))
+    return torch.einsum(
+        "n p, n p c -> n c", weights.flatten(1), features.permute(0, 2, 3, 1).flatten(1, 2)
+    )
 
 
 class ActionHead(nn.Module):

@@ -57,27 +57,38 @@ def padding_bias(real: Bool[Tensor, "b t"]) -> Float[Tensor, "b 1 1 t"]:
 
 
 class Attention(nn.Module):
-    """Multi-head attention of `x` to `context`, without bias before and with bias after."""
+    """Multi-head attention, without bias before and with bias after."""
 
     def __init__(self, sizes: BlockSizes) -> None:
         """Queries, keys and values are each `heads * head_width` wide."""
         super().__init__()
         self.heads, self.dropout = sizes.heads, sizes.dropout
         inner = sizes.heads * sizes.head_width
-        self.to_query = nn.Linear(sizes.width, inner, bias=False)
-        self.to_key_value = nn.Linear(sizes.width, 2 * inner, bias=False)
+        # One matrix: self-attention takes one product where three would do.
+        self.to_qkv = nn.Linear(sizes.width, 3 * inner, bias=False)
         self.to_out = nn.Linear(inner, sizes.width)
 
     def forward(
-        self,
-        x: Float[Tensor, "b q d"],
-        context: Float[Tensor, "b t d"],
-        bias: Float[Tensor, "b 1 1 t"] | None = None,
+        self, x: Float[Tensor, "b t d"], bias: Float[Tensor, "b 1 1 t"] | None = None
+    ) -> Float[Tensor, "b t d"]:
+        """Let every token of `x` read all of them."""
+        q, k, v = self._heads(self.to_qkv(x), 3)
+        return self._read(q, k, v, bias)
+
+    def across(
+        self, x: Float[Tensor, "b q d"], context: Float[Tensor, "b t d"]
     ) -> Float[Tensor, "b q d"]:
-        """Read `context` at every token of `x`."""
-        q = rearrange(self.to_query(x), "b q (h d) -> b h q d", h=self.heads)
-        key_value = self.to_key_value(context)
-        k, v = rearrange(key_value, "b t (two h d) -> two b h t d", two=2, h=self.heads)
+        """Let every token of `x` read `context`."""
+        inner = self.to_out.in_features
+        (q,) = self._heads(functional.linear(x, self.to_qkv.weight[:inner]), 1)
+        k, v = self._heads(functional.linear(context, self.to_qkv.weight[inner:]), 2)
+        return self._read(q, k, v, None)
+
+    def _heads(self, projected: Float[Tensor, "b t _"], parts: int) -> tuple[Tensor, ...]:
+        pattern = "b t (parts h d) -> parts b h t d"
+        return rearrange(projected, pattern, parts=parts, h=self.heads).unbind()
+
+    def _read(self, q: Tensor, k: Tensor, v: Tensor, bias: Tensor | None) -> Tensor:
         dropout = self.dropout if self.training else 0.0
         read = attend(q, k, v, bias=bias, dropout=dropout)
         return self.to_out(rearrange(read, "b h q d -> b q (h d)"))
@@ -113,8 +124,7 @@ class SelfBlock(nn.Module):
         self, x: Float[Tensor, "b t d"], bias: Float[Tensor, "b 1 1 t"] | None = None
     ) -> Float[Tensor, "b t d"]:
         """Mix the tokens of `x`."""
-        normed = self.norm_attention(x)
-        x = x + self.attention(normed, normed, bias)
+        x = x + self.attention(self.norm_attention(x), bias)
         return x + self.feed_forward(self.norm_hidden(x))
 
 
@@ -134,7 +144,7 @@ class CrossBlock(nn.Module):
         self, queries: Float[Tensor, "b q d"], context: Float[Tensor, "b t d"]
     ) -> Float[Tensor, "b q d"]:
         """Update the queries from the context."""
-        read = self.attention(self.norm_query(queries), self.norm_context(context))
+        read = self.attention.across(self.norm_query(queries), self.norm_context(context))
         queries = queries + read
         return queries + self.feed_forward(self.norm_hidden(queries))
 

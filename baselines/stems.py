@@ -49,6 +49,15 @@ def convolution(
     return layer
 
 
+def separable(fan_in: int, fan_out: int) -> nn.Sequential:
+    """A 3x3 convolution of each channel alone, then a 1x1: a third of the time of a full 3x3."""
+    alone = nn.Conv2d(fan_in, fan_in, 3, padding=1, groups=fan_in)
+    mixed = nn.Conv2d(fan_in, fan_out, 1)
+    for layer in (alone, mixed):
+        init_plain(layer)
+    return nn.Sequential(alone, mixed)
+
+
 class PatchStem(nn.Module):
     """RVT's: a 1x1 convolution, whose output is the skip, then one convolution per patch."""
 
@@ -128,9 +137,8 @@ class PyramidDecoder(nn.Module):
         steps = zip(pyramid, (*pyramid[1:], token_channels), strict=True)
         self.risers = nn.ModuleList(convolution(b, a, 1) for a, b in steps)
         self.laterals = nn.ModuleList(convolution(a, a, 1) for a in pyramid)
-        self.mixers = nn.ModuleList(convolution(a, a, 3) for a in pyramid[1:])
-        self.heat = nn.Conv2d(pyramid[0], 4, 3, padding=1)
-        init_plain(self.heat)
+        self.mixers = nn.ModuleList(separable(a, a) for a in pyramid[1:])
+        self.heat = separable(pyramid[0], 4)
 
     def forward(
         self, tokens: Float[Tensor, "n c g g"], skips: Maps

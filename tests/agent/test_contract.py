@@ -72,10 +72,10 @@ def test_presets_are_what_the_command_line_offers(name: str) -> None:
 def test_one_batch_can_be_overfitted(network: Network, config: Any) -> None:
     batch = with_painted_target(batch_for(network, config, size=2))
     optimiser = Lamb(network, weight_decay=0.0)
-    for _ in range(100):
+    for step in range(100):
         loss, _ = network.loss(batch)
         loss.backward()
-        optimiser.step(0.02)
+        optimiser.step(0.02 * (1 - step / 100))
     with torch.no_grad():
         found = network.eval().act(batch.inputs)
     labels = batch.labels
