@@ -67,8 +67,8 @@ class KeyframeExecutor:
 
     def begin(self) -> None:
         """Read the scene as it is now."""
-        self._world = CollisionWorld(self._arm, self._robot, self._base)
-        self._planner = Planner(self._arm, self._world)
+        self.world = CollisionWorld(self._arm, self._robot, self._base)
+        self._planner = Planner(self._arm, self.world)
         self._gripper_open = bool(self._fingers().mean() > 0.9 * OPEN_M)
 
     def plan(self, keyframe: Keyframe) -> Plan | Refusal:
@@ -76,7 +76,7 @@ class KeyframeExecutor:
 
         A plan that respects collisions and fails is refused; it is never retried without.
         """
-        path = self._path(keyframe, self._state())
+        path = self._path(keyframe, self.state())
         if isinstance(path, Refusal):
             return path
         return Plan(path, timed(path, self._base.control_freq))
@@ -99,7 +99,7 @@ class KeyframeExecutor:
 
         A movable body between the closing fingers goes with the hand until they open.
         """
-        state, gripper_open = self._state(), self._gripper_open
+        state, gripper_open = self.state(), self._gripper_open
         for keyframe in keyframes:
             path = self._path(keyframe, state)
             if isinstance(path, Refusal):
@@ -109,6 +109,21 @@ class KeyframeExecutor:
                 state = self._with_gripper(state, gripper_open=keyframe.gripper_open)
                 gripper_open = keyframe.gripper_open
         return None
+
+    def state(self) -> MotionState:
+        """Where arm, fingers and bodies are now."""
+        world_in_base = base_in_world(self._base).inverse()
+        state = MotionState(
+            joints=self._joints(),
+            finger_m=float(self._fingers().mean()),
+            bodies_in_base=tuple(
+                world_in_base * to_se3(body.entity.pose) for body in self.world.bodies
+            ),
+            held=None,
+        )
+        if self._gripper_open:
+            return state
+        return replace(state, held=self.world.body_between_fingers(state))
 
     def _path(self, keyframe: Keyframe, state: MotionState) -> Path | Refusal:
         target = _to_pose(keyframe)
@@ -127,22 +142,8 @@ class KeyframeExecutor:
         if gripper_open:
             return replace(state, finger_m=OPEN_M, held=None)
         # The fingers stay apart in the plan: wider than they will be, so on the safe side.
-        held = self._world.body_between_fingers(state)
+        held = self.world.body_between_fingers(state)
         return replace(state, held=held, finger_m=0.0 if held is None else state.finger_m)
-
-    def _state(self) -> MotionState:
-        world_in_base = base_in_world(self._base).inverse()
-        state = MotionState(
-            joints=self._joints(),
-            finger_m=float(self._fingers().mean()),
-            bodies_in_base=tuple(
-                world_in_base * to_se3(body.entity.pose) for body in self._world.bodies
-            ),
-            held=None,
-        )
-        if self._gripper_open:
-            return state
-        return replace(state, held=self._world.body_between_fingers(state))
 
     def _without_lag(self, motion: Path) -> Path:
         """Targets that make the joints be where they should be after each control step.
