@@ -38,6 +38,8 @@ class Loader(Protocol):
     ) -> Policy:
         """Make the policy for `tasks`; without `checkpoint` it chooses its released one.
 
+        A policy with weights carries their hash as `checkpoint_sha256`, which every record stores.
+
         Raises:
             UsageError: the checkpoint does not fit, or nothing released covers the tasks.
         """
