@@ -69,6 +69,7 @@ class Trainer:
         """
         # Dropout draws from torch's global generator: fix it by step, or a resumed run differs.
         torch.manual_seed(int(stream(self._seed, self.step, "torch").integers(2**63)))
+        # D-precision: bfloat16 in the `cpu` preset.
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.precision == "bf16"):
             loss, terms = self.network.loss(batch)
         if not torch.isfinite(loss):
