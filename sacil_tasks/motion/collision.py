@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64
 from mani_skill.envs.sapien_env import BaseEnv
 
 from sacil_tasks.motion.bodies import BASE_LINK, RobotShapes, gap_m, read_bodies
-from sacil_tasks.motion.kinematics import ARM_JOINTS, SRDF, Joints, PandaArm, Path
+from sacil_tasks.motion.kinematics import ARM_JOINTS, SRDF, JointPath, Joints, PandaArm
 from sacil_tasks.motion.shapes import Placed
 
 MARGIN_M = 0.01
@@ -36,6 +36,9 @@ EMPTY_M = 0.002
 """Closed fingers nearer to the middle than this hold nothing."""
 
 HAND_JOINT = 7
+ARM, HAND, NOTHING = -1, -2, -3
+"""Owners of geometry beside the bodies, which are numbered from 0."""
+
 Gaps: TypeAlias = dict[int, float]
 """Distance (m) by collision pair, for the pairs closer than their margin."""
 
@@ -77,10 +80,9 @@ class CollisionWorld:
         self._arm = arm
         self._model = pin.GeometryModel()
         self._owner: list[int] = []
-        self._in_hand: list[bool] = []
         self._add_robot(robot)
         self._parts = [
-            _Part(self._add(body.name, 0, 0, placed, owner=index), index, placed)
+            _Part(self._add(body.name, 0, 0, placed, index), index, placed)
             for index, body in enumerate(self.bodies)
             for placed in body.shapes
         ]
@@ -135,7 +137,7 @@ class CollisionWorld:
             stop_at_first_collision=True,
         )
 
-    def is_path_free(self, path: Path) -> bool:
+    def is_path_free(self, path: JointPath) -> bool:
         """Whether every pair keeps its distance everywhere along the joint segments."""
         return all(
             self.is_free(joints) for start, end in pairwise(path) for joints in _between(start, end)
@@ -168,23 +170,13 @@ class CollisionWorld:
             origin = model.frames[frame]
             for geometry, pose in shapes:
                 placed = (geometry, origin.placement * pose)
-                in_hand = "hand" in link or "finger" in link
-                self._add(link, origin.parentJoint, frame, placed, owner=-1, in_hand=in_hand)
+                owner = HAND if "hand" in link or "finger" in link else ARM
+                self._add(link, origin.parentJoint, frame, placed, owner)
         self._model.addAllCollisionPairs()
         pin.removeCollisionPairs(model, self._model, SRDF)
 
-    def _add(
-        self,
-        name: str,
-        joint: int,
-        frame: int,
-        placed: Placed,
-        *,
-        owner: int,
-        in_hand: bool = False,
-    ) -> int:
+    def _add(self, name: str, joint: int, frame: int, placed: Placed, owner: int) -> int:
         self._owner.append(owner)
-        self._in_hand.append(in_hand)
         label = f"{name}#{self._model.ngeoms}"
         return self._model.addGeometryObject(
             pin.GeometryObject(label, joint, frame, placed[1], placed[0])
@@ -212,12 +204,12 @@ class CollisionWorld:
         return np.logical_and.outer(robot, robot)
 
     def _activity(self, held: int | None) -> Bool[np.ndarray, "g g"]:
-        owner, in_hand = np.array(self._owner), np.array(self._in_hand)
-        carried = (owner == held) if held is not None else np.zeros(len(owner), dtype=bool)
-        robot = owner < 0
-        grip = np.logical_and.outer(carried, in_hand)
-        with_robot = np.logical_or.outer(robot, robot) & ~(grip | grip.T)
-        return with_robot | np.logical_xor.outer(carried, carried) & ~(grip | grip.T)
+        """The arm with itself and everything; what is held with everything but the hand."""
+        owner = np.array(self._owner)
+        carried = owner == (NOTHING if held is None else held)
+        grip = np.logical_and.outer(carried, owner == HAND)
+        with_robot = np.logical_or.outer(owner < 0, owner < 0)
+        return (with_robot | np.logical_xor.outer(carried, carried)) & ~(grip | grip.T)
 
     def _set_margins(self, exceptions: Gaps) -> None:
         margins = np.where(self._robot_only(), 0.0, MARGIN_M)
@@ -247,7 +239,7 @@ class CollisionWorld:
         return self._configuration
 
 
-def _between(start: Joints, end: Joints) -> Path:
+def _between(start: Joints, end: Joints) -> JointPath:
     """Points after `start` up to `end`, at most `CHECK_RAD` apart in every joint."""
     count = max(1, int(np.ceil(np.abs(end - start).max() / CHECK_RAD)))
     shares = np.arange(1, count + 1)[:, None] / count

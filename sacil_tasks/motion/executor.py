@@ -14,7 +14,7 @@ from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS, Keyframe
 from sacil_tasks.motion.bodies import base_in_world, read_robot
 from sacil_tasks.motion.collision import OPEN_M, CollisionWorld, MotionState
-from sacil_tasks.motion.kinematics import ARM_JOINTS, Joints, PandaArm, Path
+from sacil_tasks.motion.kinematics import ARM_JOINTS, JointPath, Joints, PandaArm
 from sacil_tasks.motion.planner import Planner, Refusal, timed
 from sacil_tasks.motion.shapes import to_se3
 
@@ -29,15 +29,18 @@ class ExecutorConfig:
     still: float = 5e-4
     """All stands still if no joint moves more in a control step (rad; fingers: m)."""
 
+    arrived_rad: float = 2e-3
+    """Farther from its target the arm may only be turning back from an overshoot."""
+
 
 @dataclass(frozen=True)
 class Plan:
     """How the arm will move."""
 
-    path: Path
+    path: JointPath
     """Waypoints; collision-free between them."""
 
-    motion: Path
+    motion: JointPath
     """Where the joints should be after each control step."""
 
 
@@ -125,7 +128,7 @@ class KeyframeExecutor:
             return state
         return replace(state, held=self.world.body_between_fingers(state))
 
-    def _path(self, keyframe: Keyframe, state: MotionState) -> Path | Refusal:
+    def _path(self, keyframe: Keyframe, state: MotionState) -> JointPath | Refusal:
         target = _to_pose(keyframe)
         if isinstance(target, Refusal):
             return target
@@ -145,7 +148,7 @@ class KeyframeExecutor:
         held = self.world.body_between_fingers(state)
         return replace(state, held=held, finger_m=0.0 if held is None else state.finger_m)
 
-    def _without_lag(self, motion: Path) -> Path:
+    def _without_lag(self, motion: JointPath) -> JointPath:
         """Targets that make the joints be where they should be after each control step.
 
         The PD controller follows a target like a first-order lag of damping / stiffness
@@ -162,7 +165,9 @@ class KeyframeExecutor:
         for _ in range(self._config.hold_steps):
             before = self._positions()
             self._step(target)
-            if np.abs(self._positions() - before).max() < self._config.still:
+            moved, missing = self._positions() - before, self._joints() - target
+            still = np.abs(moved).max() < self._config.still
+            if still and np.abs(missing).max() < self._config.arrived_rad:
                 return
 
     def _step(self, target: Joints) -> None:
@@ -170,7 +175,8 @@ class KeyframeExecutor:
         self._env.step(np.append(target, gripper).astype(np.float32))
 
     def _joints(self) -> Joints:
-        return self._positions()[:ARM_JOINTS]
+        # Pressed against a limit, a joint may end a hair beyond it, where no plan may start.
+        return np.clip(self._positions()[:ARM_JOINTS], self._arm.lower, self._arm.upper)
 
     def _fingers(self) -> Float64[np.ndarray, "2"]:
         return self._positions()[ARM_JOINTS:]

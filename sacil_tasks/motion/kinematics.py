@@ -15,7 +15,7 @@ from mani_skill import PACKAGE_ASSET_DIR
 from scipy.linalg.lapack import dposv
 
 Joints = Float64[np.ndarray, "7"]
-Path = Float64[np.ndarray, "n 7"]
+JointPath = Float64[np.ndarray, "n 7"]
 """Joint waypoints; what lies between two of them is a straight joint segment."""
 
 URDF = f"{PACKAGE_ASSET_DIR}/robots/panda/panda_v2.urdf"
@@ -118,7 +118,7 @@ class PandaArm:
                     solutions.append(found)
         return sorted(solutions, key=lambda joints: self._inconvenience(joints, start))
 
-    def line(self, start: Joints, target: pin.SE3) -> Path | None:
+    def line(self, start: Joints, target: pin.SE3) -> JointPath | None:
         """Joint waypoints of the straight tool path to a pose; None where it cannot be followed."""
         waypoints = [start]
         for pose in self._poses_between(self.tcp_in_base(start), target):

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 import toppra
+from jaxtyping import Float64
 from ompl import base, geometric, util
 from toppra.algorithm import TOPPRA
 from toppra.constraint import (
@@ -23,13 +24,23 @@ from toppra.constraint import (
 )
 
 from sacil_tasks.motion.collision import CHECK_RAD, CollisionWorld, MotionState
-from sacil_tasks.motion.kinematics import ARM_JOINTS, HALF_TURN, Joints, PandaArm, Path
+from sacil_tasks.motion.kinematics import ARM_JOINTS, HALF_TURN, JointPath, Joints, PandaArm
 
 # Seeding anew for each plan makes OMPL log an error each time; its streams do restart.
 util.setLogLevel(util.LOG_NONE)
 toppra.setup_logging("ERROR")
 # Objects frozen out of garbage collection look like leaks to OMPL's bindings, which say so at exit.
 atexit.register(gc.unfreeze)
+
+
+MIN_MARKS = 5
+"""A cubic spline needs four."""
+
+NO_WAY_RAD = 1e-5
+"""A shorter path is one target."""
+
+CREEP = 0.1
+"""Slowest speed (rad/s) anywhere but at the ends of a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +94,7 @@ class Planner:
 
     def path(
         self, state: MotionState, target: pin.SE3, *, ignore_obstacles: bool
-    ) -> Path | Refusal:
+    ) -> JointPath | Refusal:
         """A path from the state's joints to the pose or its half turn about the tool axis.
 
         The gripper is symmetric, so both poses grasp alike: the one nearer by rotation comes
@@ -101,7 +112,7 @@ class Planner:
             return Refusal("in_collision")
         return self._joint_path(state.joints, free)
 
-    def _straight_tool_path(self, start: Joints, target: pin.SE3) -> Path | None:
+    def _straight_tool_path(self, start: Joints, target: pin.SE3) -> JointPath | None:
         rotation = self._arm.tcp_in_base(start).rotation
         poses = sorted(
             (target, target * HALF_TURN),
@@ -115,7 +126,7 @@ class Planner:
                 return path
         return None
 
-    def _joint_path(self, start: Joints, goals: list[Joints]) -> Path | Refusal:
+    def _joint_path(self, start: Joints, goals: list[Joints]) -> JointPath | Refusal:
         for goal in goals:
             segment = np.array([start, goal])
             if self._world.open_corridor(start, goal) and self._world.is_path_free(segment):
@@ -126,7 +137,7 @@ class Planner:
                 return path
         return Refusal("no_path")
 
-    def _search(self, start: Joints, goal: Joints) -> Path | None:
+    def _search(self, start: Joints, goal: Joints) -> JointPath | None:
         """RRT-Connect with OMPL, then deterministic shortcuts."""
         self._world.open_corridor(start, goal)
         # Streams created from here on depend on this seed only, not on earlier plans.
@@ -178,7 +189,7 @@ def _to_ompl(information: base.SpaceInformation, joints: Joints) -> base.State:
     return state
 
 
-def _shortened(information: base.SpaceInformation, path: geometric.PathGeometric) -> Path:
+def _shortened(information: base.SpaceInformation, path: geometric.PathGeometric) -> JointPath:
     shortcuts = geometric.PathSimplifier(information)
     shortcuts.reduceVertices(path)
     shortcuts.partialShortcutPath(path)
@@ -186,20 +197,35 @@ def _shortened(information: base.SpaceInformation, path: geometric.PathGeometric
     return np.array([state[0:ARM_JOINTS] for state in path.getStates()])
 
 
-def timed(path: Path, rate_hz: float, config: TimingConfig | None = None) -> Path:
+def timed(path: JointPath, rate_hz: float, config: TimingConfig | None = None) -> JointPath:
     """Joint targets at the control rate along a path; the last one is the path's end."""
     config = config or TimingConfig()
-    spread = _respaced(path, config.gridpoint_rad)
-    if len(spread) < 2:
+    marks, waypoints = _respaced(path, config.gridpoint_rad)
+    if marks[-1] < NO_WAY_RAD:
         return path[-1:]
-    lengths = np.abs(np.diff(spread, axis=0)).max(axis=1)
-    positions = np.concatenate([[0.0], np.cumsum(lengths)])
-    curve = toppra.SplineInterpolator(positions, spread)
-    trajectory = TOPPRA(_limits(config), curve, gridpoints=positions, solver_wrapper="seidel")
-    motion = trajectory.compute_trajectory()
-    steps = int(np.ceil(motion.duration * rate_hz))
-    times = np.minimum(np.arange(1, steps + 1) / rate_hz, motion.duration)
-    return motion(times)
+    curve = toppra.SplineInterpolator(marks, waypoints)
+    fastest = TOPPRA(_limits(config), curve, gridpoints=marks, solver_wrapper="seidel")
+    fastest.compute_parameterization(0.0, 0.0)
+    return curve(_marks_at(rate_hz, marks, fastest.problem_data.sd_vec))
+
+
+def _marks_at(
+    rate_hz: float, marks: Float64[np.ndarray, "m"], speeds: Float64[np.ndarray, "m"] | None
+) -> Float64[np.ndarray, "steps"]:
+    """How far along the way the arm is after each control step, given the speed at each mark.
+
+    toppra's own parametrisation leaves the path where a corner brings the speed to almost zero;
+    here the speed has a floor and every stretch ends at its mark, whatever toppra says.
+    """
+    speeds = np.maximum(np.nan_to_num(np.zeros_like(marks) if speeds is None else speeds), CREEP)
+    speeds[[0, -1]] = 0.0
+    lengths = np.diff(marks)
+    clock = np.concatenate([[0.0], np.cumsum(2 * lengths / (speeds[:-1] + speeds[1:]))])
+    accelerations = np.diff(speeds**2) / (2 * lengths)
+    times = np.arange(1, int(np.ceil(clock[-1] * rate_hz)) + 1) / rate_hz
+    stretch = np.minimum(np.searchsorted(clock, times, side="right") - 1, len(lengths) - 1)
+    spent = np.minimum(times, clock[-1]) - clock[stretch]
+    return marks[stretch] + (speeds[stretch] + accelerations[stretch] * spent / 2) * spent
 
 
 @cache
@@ -210,9 +236,16 @@ def _limits(config: TimingConfig) -> list[Constraint]:
     ]
 
 
-def _respaced(path: Path, step_rad: float) -> Path:
-    """The same way with waypoints about `step_rad` apart, so that a spline cannot cut corners."""
+def _respaced(
+    path: JointPath, step_rad: float
+) -> tuple[Float64[np.ndarray, "m"], Float64[np.ndarray, "m 7"]]:
+    """Marks at most `step_rad` apart along the way, and the joints there.
+
+    Close enough that a spline cannot cut corners. Marks measure the way along the path: where it
+    turns back, neighbours may meet, and a spline over their distance would explode.
+    """
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)).max(axis=1))])
-    count = int(np.ceil(lengths[-1] / step_rad)) + 1
-    marks = np.linspace(0.0, lengths[-1], max(count, 5 if lengths[-1] > 1e-4 else 1))
-    return np.stack([np.interp(marks, lengths, path[:, j]) for j in range(ARM_JOINTS)], axis=1)
+    count = max(MIN_MARKS, int(np.ceil(lengths[-1] / step_rad)) + 1)
+    marks = np.linspace(0.0, lengths[-1], count)
+    joints = [np.interp(marks, lengths, path[:, joint]) for joint in range(ARM_JOINTS)]
+    return marks, np.stack(joints, axis=1)

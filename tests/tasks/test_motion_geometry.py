@@ -9,6 +9,7 @@ from motion_scene import WALL, make_env
 from sacil_tasks.motion.bodies import base_in_world, read_robot
 from sacil_tasks.motion.collision import MARGIN_M, OPEN_M, CollisionWorld, MotionState
 from sacil_tasks.motion.kinematics import HALF_TURN, HOME, PandaArm
+from sacil_tasks.motion.planner import TimingConfig, timed
 from sacil_tasks.motion.shapes import to_se3
 
 pytestmark = pytest.mark.sim
@@ -170,3 +171,17 @@ def test_fingers_enclose_what_crosses_the_line_between_them(env, arm, world, shi
 def test_closed_fingers_enclose_nothing(env, arm, world):
     moved = {"cube": arm.tcp_in_base(HOME)}
     assert world.body_between_fingers(state(env, world, HOME, finger_m=0.0, moved=moved)) is None
+
+
+@pytest.mark.parametrize("size_rad", [1e-7, 1e-3, 0.03, 0.3])
+def test_timing_keeps_to_a_path_that_turns_back(size_rad):
+    """Sharp corners bring the speed to zero, where toppra's own sampling has left the path."""
+    generator = np.random.default_rng(5)
+    for _ in range(40):
+        path = HOME + size_rad * generator.normal(size=(4, 7))
+        motion = timed(path, 20.0)
+        np.testing.assert_allclose(motion[-1], path[-1], atol=1e-5)
+        steps = np.abs(np.diff(np.concatenate([path[:1], motion]), axis=0))
+        assert steps.max() <= TimingConfig().velocity_rad_s / 20.0 * 1.05
+        low, high = path.min(axis=0) - 0.02, path.max(axis=0) + 0.02
+        assert ((motion >= low) & (motion <= high)).all()
