@@ -1,16 +1,18 @@
 """Kinematics and collision checks against SAPIEN's own poses and contacts."""
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
 from motion_scene import WALL, make_env
+from sapien import physx
 
-from sacil_tasks.motion.bodies import base_in_world, read_robot
+from sacil_tasks.motion.bodies import base_in_world, gap_m, read_robot
 from sacil_tasks.motion.collision import MARGIN_M, OPEN_M, CollisionWorld, MotionState
 from sacil_tasks.motion.kinematics import HALF_TURN, HOME, PandaArm
 from sacil_tasks.motion.planner import TimingConfig, timed
-from sacil_tasks.motion.shapes import to_se3
+from sacil_tasks.motion.shapes import to_coal, to_se3
 
 pytestmark = pytest.mark.sim
 
@@ -185,3 +187,24 @@ def test_timing_keeps_to_a_path_that_turns_back(size_rad):
         assert steps.max() <= TimingConfig().velocity_rad_s / 20.0 * 1.05
         low, high = path.min(axis=0) - 0.02, path.max(axis=0) + 0.02
         assert ((motion >= low) & (motion <= high)).all()
+
+
+MATERIAL = physx.PhysxMaterial(0.5, 0.5, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "extents_m"),
+    [
+        (physx.PhysxCollisionShapeBox((0.1, 0.2, 0.3), MATERIAL), (0.1, 0.2, 0.3)),
+        (physx.PhysxCollisionShapeSphere(0.1, MATERIAL), (0.1, 0.1, 0.1)),
+        (physx.PhysxCollisionShapeCapsule(0.1, 0.2, MATERIAL), (0.3, 0.1, 0.1)),
+        (physx.PhysxCollisionShapeCylinder(0.1, 0.2, MATERIAL), (0.2, 0.1, 0.1)),
+    ],
+    ids=["box", "sphere", "capsule", "cylinder"],
+)
+def test_shapes_reach_as_far_along_each_axis_as_in_physx(shape, extents_m):
+    radius = 1e-3
+    gaps = [
+        gap_m(to_coal(shape), (coal.Sphere(radius), pin.SE3(np.eye(3), axis))) for axis in np.eye(3)
+    ]
+    np.testing.assert_allclose(1.0 - radius - np.array(gaps), extents_m, atol=1e-4)
