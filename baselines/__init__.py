@@ -1,0 +1,1 @@
+"""Re-implemented baselines and the kit they share: views, heatmaps, samples, trainer."""

@@ -55,7 +55,8 @@ class Loader:
 
         Goals have their own random stream, so they never change what behaviour cloning sees.
         """
-        samples = self.keyframes.draw(stream(self._seed, step, "rows"), self._recipe.batch)
+        rng = stream(self._seed, step, "rows")
+        samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.first_share)
         views, moves = self.views(samples, self._mover(step, "moves"))
         goals = None
         if self._goals:

@@ -147,8 +147,11 @@ class KeyframeSet:
             for row in shard.keyframes(episode)
         ]
 
-    def draw(self, rng: np.random.Generator, count: int) -> list[Sample]:
+    def draw(self, rng: np.random.Generator, count: int, first_share: float | None) -> list[Sample]:
         """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
+
+        With `first_share`, that share of them shows the demo's first keyframe: later ones can be
+        told from where the hand is, so only the first teaches what the words mean.
 
         A draw without two sizes of one task is repeated: such a batch would let a contrast be
         solved by task identity (D-two-sizes). RVT draws keyframes uniformly within a task and
@@ -159,14 +162,16 @@ class KeyframeSet:
         """
         self._require_two_meanings()
         while True:
-            samples = [self._draw_one(rng) for _ in range(count)]
+            samples = [self._draw_one(rng, first_share) for _ in range(count)]
             if self._tells_sizes_apart(samples):
                 return samples
 
-    def _draw_one(self, rng: np.random.Generator) -> Sample:
+    def _draw_one(self, rng: np.random.Generator, first_share: float | None) -> Sample:
         number = int(rng.integers(len(self.shards)))
         shard = self.shards[number]
         rows = shard.keyframes(int(rng.integers(len(shard))))
+        if first_share is not None and len(rows) > 1:
+            rows = rows[:1] if rng.random() < first_share else rows[1:]
         return Sample(number, rows[int(rng.integers(len(rows)))])
 
     def _tells_sizes_apart(self, samples: Sequence[Sample]) -> bool:

@@ -1,0 +1,1 @@
+"""SACIL: Size-Aware Contrastive Imitation Learning."""

@@ -133,13 +133,14 @@ class Stage:
         return self.env.outcome()
 
     def fingerprint(self) -> str:
-        """Hash of geometry, poses (rounded to 1e-6) and words: equal scenes have equal ones."""
-        numbers = {
-            "sizes_m": self.env.sizes_m,
-            "candidate_in_base": self.env.candidate_in_base(),
-        }
-        rounded = {name: np.round(value, 6).tolist() for name, value in numbers.items()}
-        content = json.dumps(rounded | {"words": self.env.get_language_instruction()})
+        """Hash of sizes, states (rounded to 1e-6) and words: equal scenes have equal ones."""
+        state = self.env.get_state_dict()
+        bodies = state["actors"] | state["articulations"]
+        numbers = {name: values[0].numpy() for name, values in bodies.items()}
+        numbers["sizes_m"] = self.env.sizes_m
+        # Adding 0 turns -0 into 0, which is the same number but another text.
+        rounded = {name: (np.round(v, 6) + 0.0).tolist() for name, v in sorted(numbers.items())}
+        content = json.dumps([rounded, self.env.get_language_instruction()])
         return hashlib.sha256(content.encode()).hexdigest()
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ Every builder takes the parallel scene it builds in, so that sizes may differ fr
 """
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import sapien
@@ -17,7 +17,7 @@ from sapien.wrapper.articulation_builder import LinkBuilder
 from torch import Tensor
 from transforms3d.euler import euler2quat
 
-Rgb = Sequence[float]
+Rgb: TypeAlias = Sequence[float]
 Prop = TypeVar("Prop", Actor, Articulation)
 Length = TypeVar("Length", float, Tensor)
 

@@ -5,6 +5,8 @@ and the expert's keyframes. World frame: table top at z = 0, robot base at x = -
 """
 
 import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, ClassVar
 
@@ -136,7 +138,7 @@ class SizedTableEnv(BaseEnv):
         return tuple(sizes.LABELS[label] for label in self._labels[0].tolist())
 
     @property
-    def sizes_m(self) -> Float64[np.ndarray, "3"]:
+    def sizes_m(self) -> Float32[np.ndarray, "3"]:
         """Size of each candidate of environment 0, in metres."""
         return self._sizes_m[0].cpu().numpy()
 
@@ -280,25 +282,21 @@ class SizedTableEnv(BaseEnv):
         self.scene.add_directional_light([0.7, 0.6, -1.0], [0.5, 0.5, 0.5])
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
-        with torch.device(self.device):
-            count = len(env_idx)
-            self.agent.reset(np.tile(HOME_QPOS, (count, 1)))
-            self.agent.robot.set_pose(sapien.Pose(BASE_IN_WORLD_M))
-            seeds = [int(self._episode_seed[i]) for i in env_idx.tolist()]
-            layouts = [scenes.draw_layout(self.task, seed) for seed in seeds]
-            start = self._place_candidates(env_idx, layouts)
-            self.events.restart(env_idx, start)
-            self._place_extras(env_idx, layouts)
-            self._say(env_idx, seeds, options)
+        self.agent.reset(np.tile(HOME_QPOS, (len(env_idx), 1)))
+        self.agent.robot.set_pose(sapien.Pose(BASE_IN_WORLD_M))
+        seeds = [int(self._episode_seed[i]) for i in env_idx.tolist()]
+        layouts = [scenes.draw_layout(self.task, seed) for seed in seeds]
+        self.events.restart(env_idx, self._place_candidates(env_idx, layouts))
+        self._place_extras(env_idx, layouts)
+        self._say(env_idx, seeds, options)
 
     def _place_candidates(
         self, env_idx: Tensor, layouts: list[scenes.Layout]
     ) -> Float[Tensor, "n 3 3"]:
-        xy_m = torch.as_tensor(np.stack([layout.xy_m for layout in layouts])).float()
-        yaw_rad = torch.as_tensor(np.stack([layout.yaw_rad for layout in layouts])).float()
+        xy_m = self._to_tensor([layout.xy_m for layout in layouts])
         height_m = self._rest_height_m(self._sizes_m)[env_idx]
-        position = torch.cat([xy_m.to(height_m), height_m[..., None]], dim=-1)
-        self._yaw_rad[env_idx] = yaw_rad.to(height_m)
+        position = torch.cat([xy_m, height_m[..., None]], dim=-1)
+        self._yaw_rad[env_idx] = self._to_tensor([layout.yaw_rad for layout in layouts])
         half = self._yaw_rad[env_idx] / 2
         nothing = torch.zeros_like(half)
         quaternion = torch.stack([half.cos(), nothing, nothing, half.sin()], dim=-1)
@@ -312,7 +310,7 @@ class SizedTableEnv(BaseEnv):
             drawn, template = instructions.draw_words(self.task, scenes.stream(seed, "instruction"))
             words = options.get("slots", drawn)
             asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
-            self._asked[i] = torch.tensor(asked)
+            self._asked[i] = torch.tensor(asked, device=self.device)
             self._template[i] = options.get("template", template)
         self._find_targets()
 
@@ -373,6 +371,20 @@ class SizedTableEnv(BaseEnv):
             self._find_targets()
 
     # Helpers -------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _writing_state(self) -> Iterator[None]:
+        """Between two control steps: on the GPU, poses and targets are written in bulk."""
+        if self.gpu_sim_enabled:
+            self.scene._gpu_fetch_all()  # noqa: SLF001 -- as ManiSkill's own tasks do
+        yield
+        if self.gpu_sim_enabled:
+            self.scene._gpu_apply_all()  # noqa: SLF001
+            self.scene._gpu_fetch_all()  # noqa: SLF001
+
+    def _to_tensor(self, rows: list[np.ndarray]) -> Float[Tensor, "n ..."]:
+        """Stack rows drawn by numpy."""
+        return torch.as_tensor(np.stack(rows), dtype=torch.float32, device=self.device)
 
     def _find_targets(self) -> None:
         """Resolve the words into candidates; called when words change."""

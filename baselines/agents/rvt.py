@@ -55,6 +55,7 @@ CPU = RvtConfig()
 PAPER_RECIPE = Recipe(
     samples=133_000 * 18,
     batch=18,
+    first_share=None,
     lr=1.8e-3,
     warmup_steps=2000,
     ema_decay=0.0,

@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
@@ -69,8 +68,8 @@ class PickAndLiftEnv(SizedTableEnv):
         self.goal = props.build_goal(self.scene, "goal", GOAL_RADIUS_M)
 
     def _place_extras(self, env_idx: Tensor, layouts: list[Layout]) -> None:
-        goals_m = torch.as_tensor(np.stack([layout.goal_m for layout in layouts])).float()
-        self.goal.set_pose(Pose.create_from_pq(goals_m.to(self.device)))
+        goals_m = self._to_tensor([layout.goal_m for layout in layouts])
+        self.goal.set_pose(Pose.create_from_pq(goals_m))
 
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
         gaps_m = (self._sensor.positions() - self.goal.pose.p[:, None]).norm(dim=-1)

@@ -70,7 +70,7 @@ class PushButtonsEnv(SizedTableEnv):
     def _place_extras(self, env_idx: Tensor, layouts: list[Layout]) -> None:
         for button in self.candidates:
             button.set_qpos(torch.zeros((len(env_idx), 1)))
-        self._show_pressed()
+        self._show_pressed(env_idx)
 
     def _touchable(self) -> list[Link]:
         return [button.links_map["cap"] for button in self.candidates]
@@ -79,17 +79,17 @@ class PushButtonsEnv(SizedTableEnv):
         self._touch_and_carry()
         travel_m = torch.cat([button.qpos for button in self.candidates], dim=-1)
         if self.events.handle(travel_m < PRESSED_M).any():
-            self._show_pressed()
+            with self._writing_state():
+                self._show_pressed(torch.arange(self.num_envs, device=self.device))
 
-    def _show_pressed(self) -> None:
+    def _show_pressed(self, env_idx: Tensor) -> None:
         """Hold pressed caps down and mark them; called at the few steps at which this changes."""
-        pressed = self.events.handle_order > 0
+        pressed = self.events.handle_order[env_idx] > 0
         for k, (button, marker) in enumerate(zip(self.candidates, self.markers, strict=True)):
-            down = pressed[:, k : k + 1]
-            button.active_joints[0].set_drive_target(torch.where(down, LATCHED_M, 0.0)[:, 0])
-            top = torch.where(down[:, 0], _CAP_TOP_M + LATCHED_M, PARKED_M)
-            position = self.events.start[:, k].clone()
-            position[:, 2] = top
+            down = pressed[:, k]
+            button.active_joints[0].set_drive_target(torch.where(down, LATCHED_M, 0.0))
+            position = self.events.start[env_idx, k]
+            position[:, 2] = torch.where(down, _CAP_TOP_M + LATCHED_M, PARKED_M)
             marker.set_pose(Pose.create_from_pq(position))
 
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
@@ -99,7 +99,8 @@ class PushButtonsEnv(SizedTableEnv):
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         """Restore presses too: drive targets are not part of ManiSkill's state."""
         super().set_state_dict(state, env_idx)
-        self._show_pressed()
+        with self._writing_state():
+            self._show_pressed(torch.arange(self.num_envs, device=self.device))
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         keyframes = []

@@ -73,7 +73,7 @@ def test_goals_and_noise_do_not_change_what_behaviour_cloning_sees(keyframes):
 
 def test_every_batch_tells_two_sizes_of_one_task_apart(keyframes):
     for step in range(200):
-        samples = keyframes.draw(stream(0, step, "rows"), 2)
+        samples = keyframes.draw(stream(0, step, "rows"), 2, None)
         assert len({keyframes.meaning(s) for s in samples}) > len({s.shard for s in samples})
 
 
@@ -81,12 +81,22 @@ def test_tasks_then_demos_are_drawn_uniformly(tmp_path):
     synthetic.write_file(tmp_path, "pick_and_lift", demos=3)
     synthetic.write_file(tmp_path, "pick_up_cup", demos=12)
     keyframes = KeyframeSet.load(tmp_path / "canon/train/keyframes", TASKS)
-    drawn = [s for step in range(250) for s in keyframes.draw(stream(1, step, "rows"), 16)]
+    drawn = [s for step in range(250) for s in keyframes.draw(stream(1, step, "rows"), 16, 0.5)]
     tasks = Counter(sample.shard for sample in drawn)
     demos = Counter((sample.shard, keyframes.episode(sample)) for sample in drawn)
     assert tasks[0] / len(drawn) == pytest.approx(0.5, abs=0.03)
     assert min(demos[0, e] for e in range(3)) > 0.8 * tasks[0] / 3
     assert min(demos[1, e] for e in range(12)) > 0.7 * tasks[1] / 12
+
+
+@pytest.mark.parametrize(("share", "expected"), [(None, 1 / synthetic.KEYFRAMES), (0.5, 0.5)])
+def test_first_keyframes_have_the_share_asked_for(keyframes, share, expected):
+    drawn = [s for step in range(250) for s in keyframes.draw(stream(2, step, "rows"), 16, share)]
+    rows = Counter(
+        s.row - keyframes.shards[s.shard].first_rows[keyframes.episode(s)] for s in drawn
+    )
+    assert rows[0] / len(drawn) == pytest.approx(expected, abs=0.03)
+    assert rows[1] == pytest.approx(rows[2], rel=0.15), "later keyframes stay alike"
 
 
 def test_only_observations_with_a_keyframe_are_samples(keyframes):
@@ -97,7 +107,7 @@ def test_only_observations_with_a_keyframe_are_samples(keyframes):
 
 def test_goal_is_the_next_observation(keyframes):
     batch = loader(keyframes, goals=True, augment=STILL).batch(0)
-    drawn = keyframes.draw(stream(0, 0, "rows"), 6)
+    drawn = keyframes.draw(stream(0, 0, "rows"), 6, Recipe().first_share)
     after = [Sample(s.shard, s.row + 1) for s in drawn]
     # Of an observation that leads nowhere `plain` has no label, but it has views.
     views = loader(keyframes).views(after, lambda _: NO_MOVE)[0]
