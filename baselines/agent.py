@@ -27,15 +27,15 @@ AGENT_PACKAGES = ("baselines.agents", "sacil_agent.agents")
 class Recipe:
     """How a network is trained; shared by all agents so that tables compare methods."""
 
-    samples: int = 56_000
+    samples: int = 112_000
     """Behaviour-cloning samples in all: the budget, whatever the machine's speed."""
 
     batch: int = 16
     """Samples of one step."""
 
-    first_share: float | None = 0.5
-    """Share of samples that show the first keyframe of a demo, where the words decide where to go
-    (D-first-share); None draws all keyframes alike."""
+    choice_share: float | None = 0.5
+    """Share of samples that show a keyframe at which the words decide where to go: the first one
+    of each candidate to be handled (D-choice-share); None draws all keyframes alike."""
 
     lr: float = 6e-3
     """Peak learning rate of LAMB; settled on `val` (RVT's rule for its own size: 1e-4 a sample)."""

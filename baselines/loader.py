@@ -56,7 +56,7 @@ class Loader:
         Goals have their own random stream, so they never change what behaviour cloning sees.
         """
         rng = stream(self._seed, step, "rows")
-        samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.first_share)
+        samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.choice_share)
         views, moves = self.views(samples, self._mover(step, "moves"))
         goals = None
         if self._goals:

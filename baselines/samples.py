@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
-from sacil_tasks.keyframes import OBSERVATION_COLUMNS, Episode, KeyframeFile
+from sacil_tasks.keyframes import NO_ROW, OBSERVATION_COLUMNS, Episode, KeyframeFile
 
 STREAMS = ("rows", "moves", "goals", "noise", "torch")
 """Random streams of a step: one more stream never changes what another draws."""
@@ -77,6 +77,12 @@ class Shard:
     @cached_property
     def _rows(self) -> Sequence[int]:
         return np.bincount(self.columns["episode_id"], minlength=len(self.episodes)).tolist()
+
+    def choices(self, episode: int) -> list[int]:
+        """Rows at which the words decide: the first, and those that turn to another candidate."""
+        rows, targets = self.keyframes(episode), self.columns["target_index"]
+        turns = [row for row in rows[1:] if NO_ROW != targets[row] != targets[row - 1]]
+        return [*rows[:1], *turns]
 
     def observation(self, row: int) -> Observation:
         """The observation of `row`, as a policy would have seen it; nothing is copied."""
@@ -147,11 +153,13 @@ class KeyframeSet:
             for row in shard.keyframes(episode)
         ]
 
-    def draw(self, rng: np.random.Generator, count: int, first_share: float | None) -> list[Sample]:
+    def draw(
+        self, rng: np.random.Generator, count: int, choice_share: float | None
+    ) -> list[Sample]:
         """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
 
-        With `first_share`, that share of them shows the demo's first keyframe: later ones can be
-        told from where the hand is, so only the first teaches what the words mean.
+        With `choice_share`, that share of them shows a keyframe at which the words decide: others
+        can be told from where the hand is, so they do not teach what the words mean.
 
         A draw without two sizes of one task is repeated: such a batch would let a contrast be
         solved by task identity (D-two-sizes). RVT draws keyframes uniformly within a task and
@@ -162,16 +170,19 @@ class KeyframeSet:
         """
         self._require_two_meanings()
         while True:
-            samples = [self._draw_one(rng, first_share) for _ in range(count)]
+            samples = [self._draw_one(rng, choice_share) for _ in range(count)]
             if self._tells_sizes_apart(samples):
                 return samples
 
-    def _draw_one(self, rng: np.random.Generator, first_share: float | None) -> Sample:
+    def _draw_one(self, rng: np.random.Generator, choice_share: float | None) -> Sample:
         number = int(rng.integers(len(self.shards)))
         shard = self.shards[number]
-        rows = shard.keyframes(int(rng.integers(len(shard))))
-        if first_share is not None and len(rows) > 1:
-            rows = rows[:1] if rng.random() < first_share else rows[1:]
+        episode = int(rng.integers(len(shard)))
+        rows: Sequence[int] = shard.keyframes(episode)
+        if choice_share is not None:
+            choices = shard.choices(episode)
+            others = [row for row in rows if row not in choices]
+            rows = choices if rng.random() < choice_share else others or choices
         return Sample(number, rows[int(rng.integers(len(rows)))])
 
     def _tells_sizes_apart(self, samples: Sequence[Sample]) -> bool:

@@ -33,7 +33,8 @@ class Score:
     group: tuple[str, str]
     """Task, and the size words of its instruction."""
 
-    first: bool
+    choice: bool
+    """Whether the words decide here (`Shard.choices`)."""
     position_mm: float
     rotation_deg: float
     gripper_right: bool
@@ -60,8 +61,8 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
         "position_mm": round(float(np.median([s.position_mm for s in scores])), 2),
         "rotation_within_5deg": sum(s.rotation_deg <= ROTATION_DEG for s in scores),
         "gripper_right": sum(s.gripper_right for s in scores),
-        "selected_first": _tally([s for s in meant if s.first]),
-        "selected_later": _tally([s for s in meant if not s.first]),
+        "selected_by_words": _tally([s for s in meant if s.choice]),
+        "selected_by_hand": _tally([s for s in meant if not s.choice]),
     }
 
 
@@ -82,7 +83,7 @@ def _score_batch(network: Network, loader: Loader, samples: list[Sample]) -> Ite
         words = shard.episodes[loader.keyframes.episode(sample)].slots.values()
         yield Score(
             group=(shard.task, "+".join(words)),
-            first=bool(batch.first[i]),
+            choice=sample.row in shard.choices(loader.keyframes.episode(sample)),
             position_mm=1000 * float(np.linalg.norm(reached - asked[:3])),
             rotation_deg=grip_angle_deg(chosen.quaternion_wxyz[i].numpy(), asked[3:]),
             gripper_right=bool(right[i]),

@@ -90,13 +90,20 @@ def test_tasks_then_demos_are_drawn_uniformly(tmp_path):
 
 
 @pytest.mark.parametrize(("share", "expected"), [(None, 1 / synthetic.KEYFRAMES), (0.5, 0.5)])
-def test_first_keyframes_have_the_share_asked_for(keyframes, share, expected):
+def test_keyframes_at_which_words_decide_have_the_share_asked_for(keyframes, share, expected):
     drawn = [s for step in range(250) for s in keyframes.draw(stream(2, step, "rows"), 16, share)]
     rows = Counter(
         s.row - keyframes.shards[s.shard].first_rows[keyframes.episode(s)] for s in drawn
     )
     assert rows[0] / len(drawn) == pytest.approx(expected, abs=0.03)
     assert rows[1] == pytest.approx(rows[2], rel=0.15), "later keyframes stay alike"
+
+
+def test_words_decide_whenever_another_candidates_turn_comes(keyframes):
+    columns = keyframes.shards[0].columns | {"target_index": np.array([1, 1, 2, -1, -1, 0, 0, -1])}
+    shard = replace(keyframes.shards[0], columns=columns)
+    assert shard.choices(0) == [0, 2]
+    assert shard.choices(1) == [4, 5], "the first keyframe, though it serves no candidate"
 
 
 def test_only_observations_with_a_keyframe_are_samples(keyframes):
@@ -107,7 +114,7 @@ def test_only_observations_with_a_keyframe_are_samples(keyframes):
 
 def test_goal_is_the_next_observation(keyframes):
     batch = loader(keyframes, goals=True, augment=STILL).batch(0)
-    drawn = keyframes.draw(stream(0, 0, "rows"), 6, Recipe().first_share)
+    drawn = keyframes.draw(stream(0, 0, "rows"), 6, Recipe().choice_share)
     after = [Sample(s.shard, s.row + 1) for s in drawn]
     # Of an observation that leads nowhere `plain` has no label, but it has views.
     views = loader(keyframes).views(after, lambda _: NO_MOVE)[0]

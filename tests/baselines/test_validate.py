@@ -48,8 +48,8 @@ def test_the_expert_scores_full_marks(loader, batch):
     assert scores["all"]["keyframes"] == 9
     assert scores["all"]["position_mm"] < 0.01
     assert scores["all"]["rotation_within_5deg"] == scores["all"]["gripper_right"] == 9
-    assert scores["all"]["selected_first"] == (3, 3)
-    assert scores["all"]["selected_later"] == (6, 6)
+    assert scores["all"]["selected_by_words"] == (3, 3)
+    assert scores["all"]["selected_by_hand"] == (6, 6)
 
 
 def test_scores_are_split_by_task_and_size(loader):
@@ -62,7 +62,7 @@ def test_scores_are_split_by_task_and_size(loader):
 def test_reaching_for_a_neighbour_is_a_wrong_selection(loader):
     scores = validate(Cheat(loader, shift_m=(0.0, 0.2, 0.0)), loader)
     assert scores["all"]["position_mm"] == pytest.approx(200, abs=0.1)
-    assert scores["all"]["selected_first"] == (0, 3)
+    assert scores["all"]["selected_by_words"] == (0, 3)
 
 
 def test_reaching_is_judged_from_above_within_a_radius():
