@@ -18,13 +18,14 @@ from sacil_tasks.cameras import observe
 from sacil_tasks.catalog import env_id, task_spec
 from sacil_tasks.demos import ENV_KWARGS
 from sacil_tasks.errors import UsageError
-from sacil_tasks.instructions import Slots, draw_words, variations
+from sacil_tasks.instructions import Slots, variations
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Observation
 from sacil_tasks.motion.executor import KeyframeExecutor
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.recording import StepRecorder
-from sacil_tasks.scenes import ATTEMPTS, scene_seed, stream
+from sacil_tasks.scenes import ATTEMPTS, scene_seed
 from sacil_tasks.table import SizedTableEnv
+from sacil_tasks.wording import draw_meaning
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Stage:
         `template` None: as the scene's instruction stream draws it.
         """
         started = time.perf_counter()
-        slots = variations(self.spec)[variation]
+        slots = variations(self.spec, split)[variation]
         known = scene in self._accepted
         if not known:
             self._accepted[scene] = self._find_attempt(scene, slots, template)
@@ -161,7 +162,7 @@ class Stage:
         self.attempt = attempt
         self.seed = scene_seed(scene.partition, scene.scene_set, scene.task, scene.index, attempt)
         if template is None:
-            template = draw_words(self.spec, stream(self.seed, "instruction"))[1]
+            template = draw_meaning(self.spec, split, self.seed)[1]
         self.options = {"slots": slots, "template": template, "split": split}
         self.recorder.reset(seed=self.seed, options=dict(self.options))
         self._executor.begin()

@@ -1,22 +1,24 @@
 """Slots of meaning -> sentences, and back-checks of what a user asks for. Pure."""
 
+import re
 from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
 
 from sacil_tasks.errors import UsageError, find_name
-from sacil_tasks.sizes import LABELS
 from sacil_tasks.spec import TaskSpec
+from sacil_tasks.splits import SPLITS, TRAINED, Phrases
 
 Slots: TypeAlias = dict[str, str]
 """Size word of each slot, e.g. `{"first": "small", "second": "large"}`."""
 
 
-def variations(spec: TaskSpec) -> tuple[Slots, ...]:
+def variations(spec: TaskSpec, split: str = "canon") -> tuple[Slots, ...]:
     """Every way to fill the slots with different size words, in a fixed order."""
+    labels = SPLITS[split].phrases[0]
     return tuple(
-        dict(zip(spec.slots, words, strict=True)) for words in permutations(LABELS, len(spec.slots))
+        dict(zip(spec.slots, words, strict=True)) for words in permutations(labels, len(spec.slots))
     )
 
 
@@ -25,15 +27,21 @@ def all_templates(spec: TaskSpec) -> tuple[str, ...]:
     return spec.templates + spec.held_out_templates
 
 
-def render(spec: TaskSpec, slots: Slots, template: int) -> str:
-    """Fill one template.
+def render(spec: TaskSpec, slots: Slots, template: int, phrases: Phrases = TRAINED) -> str:
+    """Fill one template; `phrases` say each size of the noun that follows its blank.
 
     Raises:
         UsageError: the template index or the slots do not belong to the task.
     """
     check_template(spec, template)
     check_slots(spec, slots)
-    return all_templates(spec)[template].format(**slots)
+
+    def fill(blank: re.Match[str]) -> str:
+        return phrases[slots[blank["slot"]]].format(noun=blank["noun"])
+
+    names = "|".join(spec.slots)
+    sentence = all_templates(spec)[template]
+    return re.sub(rf"{{(?P<slot>{names})}} (?P<noun>\w+)", fill, sentence).format(**slots)
 
 
 def official_sentences(spec: TaskSpec) -> tuple[str, ...]:
@@ -45,14 +53,14 @@ def official_sentences(spec: TaskSpec) -> tuple[str, ...]:
     )
 
 
-def draw_words(spec: TaskSpec, rng: np.random.Generator) -> tuple[Slots, int]:
+def draw_words(spec: TaskSpec, rng: np.random.Generator, split: str = "canon") -> tuple[Slots, int]:
     """Slots and training template, independent and uniform."""
-    choices = variations(spec)
+    choices = variations(spec, split)
     slots = choices[int(rng.integers(len(choices)))]
     return slots, int(rng.integers(len(spec.templates)))
 
 
-def check_slots(spec: TaskSpec, slots: Slots) -> None:
+def check_slots(spec: TaskSpec, slots: Slots, split: str = "canon") -> None:
     """Accept a complete assignment of different size words.
 
     Raises:
@@ -60,11 +68,12 @@ def check_slots(spec: TaskSpec, slots: Slots) -> None:
     """
     for name, word in slots.items():
         find_name(str(name), spec.slots, f"slot of {spec.name}")
-        find_name(str(word), LABELS, "size word")
-    if slots not in variations(spec):
+        find_name(str(word), SPLITS[split].phrases[0], "size word")
+    choices = variations(spec, split)
+    if slots not in choices:
         raise UsageError(
             f"slots of {spec.name} are {', '.join(spec.slots)}, each with another size word, "
-            f"but {slots} came; choose one of {list(variations(spec))}."
+            f"but {slots} came; choose one of {list(choices)}."
         )
 
 

@@ -50,7 +50,11 @@ _RANGES = {"train": (0, 2**31), "val": (2**31, 2**30), "test": (2**31 + 2**30, 2
 """Partition -> (first seed, number of seeds); together they are all seeds of 32 bits."""
 
 PARTITIONS = tuple(_RANGES)
-STREAMS = ("geometry", "layout", "instruction")
+STREAMS = (
+    *("geometry", "layout", "instruction"),
+    *("split", "clutter", "phrases", "templates", "other"),
+)
+"""New ones go to the end: a stream is known by its place."""
 
 
 @dataclass(frozen=True)

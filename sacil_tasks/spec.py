@@ -5,7 +5,7 @@ Pure, so that episodes can be planned and results tabulated without the simulato
 
 from dataclasses import dataclass
 
-from sacil_tasks.sizes import FAMILIES
+from sacil_tasks.splits import SPLITS, why_not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,13 @@ class TaskSpec:
     yaw_limit_deg: float
     """Candidates are turned by up to this much, either way."""
 
+    clutter_region_m: tuple[tuple[float, float], tuple[float, float]] | None = (
+        (-0.22, 0.05),
+        (-0.28, 0.28),
+    )
+    """x and y range in which the split `clutter` puts one more object; None: it has no room."""
+
     @property
     def splits(self) -> tuple[str, ...]:
-        """Size splits this task can be built in."""
-        return FAMILIES[self.family].splits
+        """Splits this task has, in the order of the registry."""
+        return tuple(name for name in SPLITS if why_not(self, name) is None)

@@ -23,7 +23,7 @@ from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, instructions, props, scenes, sizes
+from sacil_tasks import cameras, instructions, props, scenes, sizes, wording
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
 from sacil_tasks.instructions import Slots
@@ -31,6 +31,8 @@ from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
+from sacil_tasks.splits import check_split
+from sacil_tasks.variant import AWAY_M, Variant
 
 HOME_QPOS = (0.0, 0.0, 0.0, -1.5, 0.0, 1.5, np.pi / 4, 0.04, 0.04)
 """Arm and fingers at the start: the gripper looks straight down, high above the table."""
@@ -119,8 +121,8 @@ class SizedTableEnv(BaseEnv):
     def get_language_instruction(self) -> list[str]:
         """One sentence per environment."""
         return [
-            instructions.render(self.task, self.slots(i), int(self._template[i]))
-            for i in range(self.num_envs)
+            self._variant.say(i, self.slots(i), int(self._template[i]), int(seed))
+            for i, seed in enumerate(self._episode_seed)
         ]
 
     def slots(self, i: int = 0) -> Slots:
@@ -150,6 +152,10 @@ class SizedTableEnv(BaseEnv):
     def candidate_in_base(self) -> Float32[np.ndarray, "3 3"]:
         """Positions of the candidates of environment 0 now, in the base frame (m)."""
         return self._sensor.positions()[0].cpu().numpy() - self.base_in_world_m
+
+    def clutter_in_base(self) -> Float32[np.ndarray, "n 3"]:
+        """Positions of objects that are no candidates in environment 0 now, in the base frame."""
+        return self._variant.clutter_in_world() - self.base_in_world_m
 
     def tcp_in_base(self) -> Float[Tensor, "b 7"]:
         """Gripper pose: position (m) and quaternion wxyz in the base frame."""
@@ -219,17 +225,18 @@ class SizedTableEnv(BaseEnv):
         return super().reset(seed, options)
 
     def _check_options(self, options: dict[str, Any]) -> None:
+        rebuild = self._will_rebuild(options)
+        split = options.get("split", "canon" if rebuild else self._split)
+        check_split(self.task, split)
+        if split != self._split and not rebuild:
+            raise UsageError(
+                f"this environment was built for the split {self._split}, but {split} came; "
+                'add "reconfigure": True to the options.'
+            )
         if "slots" in options:
-            instructions.check_slots(self.task, options["slots"])
+            instructions.check_slots(self.task, options["slots"], split)
         if "template" in options:
             instructions.check_template(self.task, options["template"])
-        if "split" in options:
-            split = find_name(options["split"], self.task.splits, f"split of {self.task.name}")
-            if split != self._split and not self._will_rebuild(options):
-                raise UsageError(
-                    f"this environment was built for the split {self._split}, but {split} came; "
-                    'add "reconfigure": True to the options.'
-                )
 
     def _will_rebuild(self, options: dict[str, Any]) -> bool:
         return self.reconfiguration_freq == 1 or options.get("reconfigure", False)
@@ -240,16 +247,15 @@ class SizedTableEnv(BaseEnv):
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")
         props.build_table(self.scene)
-        geometries = [scenes.draw_geometry(int(seed)) for seed in self._episode_seed]
-        sizes_m = np.stack(
-            [sizes.sizes_m(self.task.family, self._split, g.labels, g.jitter) for g in geometries]
-        )
+        self._variant = Variant(self.task, self._split, self._episode_seed)
+        sizes_m = self._variant.sizes_m
         self.candidates = [
-            self._build_batch(k, sizes_m[:, k], [g.rgb[k] for g in geometries])
+            self._build_batch(k, sizes_m[:, k], self._variant.rgb(k))
             for k in range(sizes.CANDIDATES)
         ]
         self._load_extras()
-        self._create_state(np.stack([g.labels for g in geometries]), sizes_m)
+        self._variant.build(self.scene)
+        self._create_state(self._variant.labels, sizes_m)
 
     def _build_batch(
         self, k: int, sizes_m: Float64[np.ndarray, "b"], rgbs: list[Float64[np.ndarray, "3"]]
@@ -286,9 +292,10 @@ class SizedTableEnv(BaseEnv):
         self.agent.robot.set_pose(sapien.Pose(BASE_IN_WORLD_M))
         seeds = [int(self._episode_seed[i]) for i in env_idx.tolist()]
         layouts = [scenes.draw_layout(self.task, seed) for seed in seeds]
+        self._say(env_idx, seeds, options)
         self.events.restart(env_idx, self._place_candidates(env_idx, layouts))
         self._place_extras(env_idx, layouts)
-        self._say(env_idx, seeds, options)
+        self._variant.place(env_idx, layouts, seeds)
 
     def _place_candidates(
         self, env_idx: Tensor, layouts: list[scenes.Layout]
@@ -296,6 +303,7 @@ class SizedTableEnv(BaseEnv):
         xy_m = self._to_tensor([layout.xy_m for layout in layouts])
         height_m = self._rest_height_m(self._sizes_m)[env_idx]
         position = torch.cat([xy_m, height_m[..., None]], dim=-1)
+        position[~self._present[env_idx]] += torch.tensor(AWAY_M, device=self.device)
         self._yaw_rad[env_idx] = self._to_tensor([layout.yaw_rad for layout in layouts])
         half = self._yaw_rad[env_idx] / 2
         nothing = torch.zeros_like(half)
@@ -307,7 +315,7 @@ class SizedTableEnv(BaseEnv):
     def _say(self, env_idx: Tensor, seeds: list[int], options: dict[str, Any]) -> None:
         """Choose the words: from the instruction stream, unless given."""
         for i, seed in zip(env_idx.tolist(), seeds, strict=True):
-            drawn, template = instructions.draw_words(self.task, scenes.stream(seed, "instruction"))
+            drawn, template = wording.draw_meaning(self.task, self._split, seed)
             words = options.get("slots", drawn)
             asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
             self._asked[i] = torch.tensor(asked, device=self.device)
@@ -390,7 +398,8 @@ class SizedTableEnv(BaseEnv):
         """Resolve the words into candidates; called when words change."""
         named = self._labels[:, None] == self._asked[..., None]
         self._targets = named.int().argmax(-1)
-        self._unnamed = ~named.any(1)
+        self._present = self._variant.present(named.any(1))
+        self._unnamed = ~named.any(1) & self._present
 
     def _touchable(self) -> list[Actor | Link]:
         """The body of each candidate that fingers act on."""

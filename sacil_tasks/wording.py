@@ -1,0 +1,45 @@
+"""Seed and split -> the sentence that is heard. Pure.
+
+Meaning (slots) and sentence part ways here: a split may say the same in other words, say nothing,
+or say what is not meant.
+"""
+
+from collections.abc import Mapping
+
+from sacil_tasks.instructions import Slots, draw_words, render, variations
+from sacil_tasks.scenes import stream
+from sacil_tasks.spec import TaskSpec
+from sacil_tasks.splits import SPLITS
+
+
+def draw_meaning(task: TaskSpec, split: str, seed: int) -> tuple[Slots, int]:
+    """Slots and template of a scene whose words are not chosen by hand."""
+    if SPLITS[split].held_out_templates:
+        slots, _ = draw_words(task, stream(seed, "instruction"), split)
+        held_out = int(stream(seed, "templates").integers(len(task.held_out_templates)))
+        return slots, len(task.templates) + held_out
+    return draw_words(task, stream(seed, "instruction"), split)
+
+
+def say(
+    task: TaskSpec,
+    split: str,
+    slots: Slots,
+    template: int,
+    *,
+    seed: int,
+    colour_of: Mapping[str, str],
+) -> str:
+    """What is heard in scene `seed` when `slots` are meant; `colour_of` names labels by colour."""
+    rules = SPLITS[split]
+    if rules.speech == "blank":
+        return ""
+    if rules.speech == "other":
+        choices = variations(task, split)
+        shift = int(stream(seed, "other").integers(len(choices)))
+        slots = choices[(choices.index(slots) + shift) % len(choices)]
+    if rules.colours:
+        phrases = {label: f"{colour} {{noun}}" for label, colour in colour_of.items()}
+    else:
+        phrases = dict(rules.phrases[int(stream(seed, "phrases").integers(len(rules.phrases)))])
+    return render(task, slots, template, phrases)
