@@ -18,9 +18,7 @@ from baselines.loader import Loader
 from baselines.rotation import multiply
 from baselines.samples import Sample, Shard
 from baselines.views import base_from_cube
-
-REACH_M = 0.06
-"""A keyframe this close to a candidate, seen from above, is meant for it."""
+from sacil_tasks.aim import nearest
 
 ROTATION_DEG = 5.0
 """A rotation is right within one bin."""
@@ -96,12 +94,6 @@ def _selected(shard: Shard, row: int, reached: Float[np.ndarray, "3"]) -> bool |
     if target < 0 or nearest(candidates, shard.columns["keyframe_in_base"][row, :3]) != target:
         return None
     return nearest(candidates, reached) == target
-
-
-def nearest(candidates: Float[np.ndarray, "k 3"], position: Float[np.ndarray, "3"]) -> int | None:
-    """The candidate within `REACH_M` of `position` seen from above, or None."""
-    distances = np.linalg.norm(candidates[:, :2] - position[:2], axis=-1)
-    return int(distances.argmin()) if distances.min() <= REACH_M else None
 
 
 def grip_angle_deg(first: Float[np.ndarray, "4"], second: Float[np.ndarray, "4"]) -> float:

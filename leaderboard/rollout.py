@@ -30,6 +30,7 @@ from leaderboard.records import (
     EpisodeRecord,
     Seconds,
 )
+from sacil_tasks.aim import nearest
 from sacil_tasks.episode import SceneKey, Stage
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Memory, Policy
@@ -44,6 +45,7 @@ class _Course:
     keyframes: int = 0
     success: bool = False
     success_lenient: bool = False
+    aimed: str = ""
     pixels: str = ""
     renderer: str = ""
     inference_s: float = 0.0
@@ -157,6 +159,7 @@ def _play(
         if move is None:
             return
         keyframe, memory = move
+        course.aimed = course.aimed or aim(stage, keyframe)
         result = stage.execute(keyframe)
         if result.refusal is not None:
             course.end, course.reason = INVALID_ACTION, result.refusal
@@ -166,6 +169,17 @@ def _play(
         if result.success_lenient:
             course.end = SUCCEEDED
             return
+
+
+def aim(stage: Stage, keyframe: Keyframe) -> str:
+    """Label of what a closing keyframe is near to, `clutter`, or nothing."""
+    if keyframe.gripper_open:
+        return ""
+    clutter = stage.env.clutter_in_base()
+    names = (*stage.env.candidate_labels, *["clutter"] * len(clutter))
+    objects = np.concatenate([stage.env.candidate_in_base(), clutter])
+    found = nearest(objects, np.asarray(keyframe.position_m))
+    return "" if found is None else names[found]
 
 
 def _look_and_act(

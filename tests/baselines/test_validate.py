@@ -9,8 +9,9 @@ from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet
 from baselines.text import SentenceTable, TextSpec, tidy
-from baselines.validate import REACH_M, grip_angle_deg, nearest, validate
+from baselines.validate import grip_angle_deg, validate
 from baselines.views import cube_from_base
+from sacil_tasks.aim import REACH_M, nearest
 
 
 @pytest.fixture(scope="module")

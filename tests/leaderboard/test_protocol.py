@@ -3,8 +3,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from leaderboard.protocol import EvalProtocol, protocol_of
-from sacil_tasks.catalog import task_names
+from leaderboard.protocol import UNRULED, EvalProtocol, protocol_name, protocol_of
+from sacil_tasks.catalog import task_names, task_spec
 
 PROTOCOL = protocol_of("pick_and_lift", "test", 0)
 
@@ -26,6 +26,26 @@ def test_tasks_partitions_and_scene_sets_have_hashes_of_their_own():
         for scene_set in (0, 1)
     ]
     assert len({protocol.hash for protocol in protocols}) == len(protocols)
+
+
+@pytest.mark.parametrize(
+    ("task", "partition", "made_before"),
+    [
+        ("pick_and_lift", "test", "48240c5573d9"),
+        ("pick_up_cup", "val", "792be3a496f9"),
+        ("push_buttons", "test", "c8d38c1ac2dc"),
+    ],
+)
+def test_results_made_before_there_were_other_splits_stay_comparable(task, partition, made_before):
+    for split in set(UNRULED) & set(task_spec(task).splits):
+        assert protocol_of(task, partition, 0, split).hash == made_before
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_other_splits_have_hashes_of_their_own(task):
+    names = {protocol_name(task, split) for split in task_spec(task).splits}
+    hashes = {protocol_of(task, "test", 0, split).hash for split in task_spec(task).splits}
+    assert len(hashes) == len(names)
 
 
 @pytest.mark.sim
