@@ -1,6 +1,6 @@
 """Slots of meaning -> sentences, and back-checks of what a user asks for. Pure."""
 
-from itertools import permutations
+from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -10,13 +10,15 @@ from sacil_tasks.sizes import LABELS
 from sacil_tasks.spec import TaskSpec
 
 Slots: TypeAlias = dict[str, str]
-"""Size word of each slot, e.g. `{"first": "small", "second": "large"}`."""
+"""Word of each blank, e.g. `{"first": "small", "second": "large"}`."""
 
 
 def variations(spec: TaskSpec) -> tuple[Slots, ...]:
-    """Every way to fill the slots with different size words, in a fixed order."""
+    """Every way to fill the blanks, sizes all different, in a fixed order."""
     return tuple(
-        dict(zip(spec.slots, words, strict=True)) for words in permutations(LABELS, len(spec.slots))
+        dict(zip(spec.blanks, (*words, *places), strict=True))
+        for words in permutations(LABELS, len(spec.slots))
+        for places in product(*spec.receptacles.values())
     )
 
 
@@ -53,17 +55,17 @@ def draw_words(spec: TaskSpec, rng: np.random.Generator) -> tuple[Slots, int]:
 
 
 def check_slots(spec: TaskSpec, slots: Slots) -> None:
-    """Accept a complete assignment of different size words.
+    """Accept a complete assignment of words, sizes all different.
 
     Raises:
         UsageError: a slot is missing or unknown, a word is unknown or used twice.
     """
     for name, word in slots.items():
-        find_name(str(name), spec.slots, f"slot of {spec.name}")
-        find_name(str(word), LABELS, "size word")
+        words = spec.blanks[find_name(str(name), spec.blanks, f"slot of {spec.name}")]
+        find_name(str(word), words, "size word" if name in spec.slots else f"word for {name}")
     if slots not in variations(spec):
         raise UsageError(
-            f"slots of {spec.name} are {', '.join(spec.slots)}, each with another size word, "
+            f"slots of {spec.name} are {', '.join(spec.blanks)}, each size with another word, "
             f"but {slots} came; choose one of {list(variations(spec))}."
         )
 
