@@ -9,10 +9,10 @@ import ast
 import importlib
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sacil_tasks.errors import find_name
-from sacil_tasks.spec import TaskSpec
+from sacil_tasks.spec import Fixture, TaskSpec
 
 if TYPE_CHECKING:
     from sacil_tasks.table import SizedTableEnv
@@ -60,9 +60,15 @@ def task_spec(task: str) -> TaskSpec:
     for node in ast.parse(path.read_text()).body:
         match node:
             case ast.Assign(targets=[ast.Name(id="SPEC")], value=ast.Call(keywords=keywords)):
-                fields = {str(key.arg): ast.literal_eval(key.value) for key in keywords}
-                return TaskSpec(**fields)
+                return TaskSpec(**{str(key.arg): _literal(key.value) for key in keywords})
     raise LookupError(f"{path.name} has no `SPEC = TaskSpec(...)` with literal arguments")
+
+
+def _literal(node: ast.expr) -> Any:
+    match node:
+        case ast.Call(func=ast.Name(id="Fixture"), keywords=keywords):
+            return Fixture(**{str(key.arg): ast.literal_eval(key.value) for key in keywords})
+    return ast.literal_eval(node)
 
 
 def suite_names() -> tuple[str, ...]:

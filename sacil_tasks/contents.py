@@ -65,8 +65,7 @@ def draw_contents(task: TaskSpec, name: str, seed: int) -> Contents:
 
 def clutter_xy_m(task: TaskSpec, layout: Layout, seed: int) -> Float64[np.ndarray, "2"]:
     """Where the clutter stands in the world frame: clear of the candidates."""
-    assert task.clutter_region_m is not None, "the registry gives `clutter` to no such task"
-    low, high = np.transpose(task.clutter_region_m)
+    low, high = np.transpose(task.clutter_region_m or task.region_m)
     spots = stream(seed, "clutter").uniform(low, high, size=(_SPOTS, 2))
     gaps_m = np.linalg.norm(spots[:, None] - layout.xy_m, axis=-1).min(axis=1)
     clear = np.flatnonzero(gaps_m >= task.spacing_m)

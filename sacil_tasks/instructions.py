@@ -1,7 +1,7 @@
 """Slots of meaning -> sentences, and back-checks of what a user asks for. Pure."""
 
 import re
-from itertools import permutations
+from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -11,14 +11,16 @@ from sacil_tasks.spec import TaskSpec
 from sacil_tasks.splits import SPLITS, TRAINED, Phrases
 
 Slots: TypeAlias = dict[str, str]
-"""Size word of each slot, e.g. `{"first": "small", "second": "large"}`."""
+"""Word of each blank, e.g. `{"first": "small", "second": "large"}`."""
 
 
 def variations(spec: TaskSpec, split: str = "canon") -> tuple[Slots, ...]:
-    """Every way to fill the slots with different size words, in a fixed order."""
+    """Every way to fill the blanks, sizes all different, in a fixed order."""
     labels = SPLITS[split].phrases[0]
     return tuple(
-        dict(zip(spec.slots, words, strict=True)) for words in permutations(labels, len(spec.slots))
+        dict(zip(spec.blanks, (*words, *places), strict=True))
+        for words in permutations(labels, len(spec.slots))
+        for places in product(*spec.receptacles.values())
     )
 
 
@@ -61,18 +63,18 @@ def draw_words(spec: TaskSpec, rng: np.random.Generator, split: str = "canon") -
 
 
 def check_slots(spec: TaskSpec, slots: Slots, split: str = "canon") -> None:
-    """Accept a complete assignment of different size words.
+    """Accept a complete assignment of words, sizes all different.
 
     Raises:
         UsageError: a slot is missing or unknown, a word is unknown or used twice.
     """
     for name, word in slots.items():
-        find_name(str(name), spec.slots, f"slot of {spec.name}")
-        find_name(str(word), SPLITS[split].phrases[0], "size word")
+        words = spec.blanks[find_name(str(name), spec.blanks, f"slot of {spec.name}")]
+        find_name(str(word), words, "size word" if name in spec.slots else f"word for {name}")
     choices = variations(spec, split)
     if slots not in choices:
         raise UsageError(
-            f"slots of {spec.name} are {', '.join(spec.slots)}, each with another size word, "
+            f"slots of {spec.name} are {', '.join(spec.blanks)}, each size with another word, "
             f"but {slots} came; choose one of {list(choices)}."
         )
 

@@ -125,7 +125,7 @@ def why_not(task: "TaskSpec", name: str) -> str | None:
         return "its words name two objects"
     if split.held_out_templates and not task.held_out_templates:
         return "it has no held-out sentences"
-    if split.clutter and task.clutter_region_m is None:
+    if split.clutter and task.fixture is not None and task.clutter_region_m is None:
         return "one more object has no room beside its furniture"
     family = FAMILIES[task.family]
     if split.ratio is None and not family.first_rungs(split.first_rungs):

@@ -23,21 +23,20 @@ from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, instructions, props, scenes, sizes, wording
+from sacil_tasks import cameras, props, scenes, sizes, wording
+from sacil_tasks.contacts import ContactLog
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
 from sacil_tasks.instructions import Slots
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
+from sacil_tasks.poses import BASE_IN_WORLD_M, upright
 from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
-from sacil_tasks.splits import check_split
 from sacil_tasks.variant import AWAY_M, Variant
 
 HOME_QPOS = (0.0, 0.0, 0.0, -1.5, 0.0, 1.5, np.pi / 4, 0.04, 0.04)
 """Arm and fingers at the start: the gripper looks straight down, high above the table."""
-
-BASE_IN_WORLD_M = (-0.615, 0.0, 0.0)
 
 
 class SizedTableEnv(BaseEnv):
@@ -95,8 +94,12 @@ class SizedTableEnv(BaseEnv):
         raise NotImplementedError
 
     def _rest_height_m(self, sizes_m: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """Height of each candidate's origin when it stands on the table."""
+        """Height of each candidate's origin where it stands at the start."""
         raise NotImplementedError
+
+    def _rest_quaternions(self, yaw_rad: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 4"]:
+        """Orientation of each candidate (wxyz) at the start, given its heading."""
+        return upright(yaw_rad)
 
     def _load_extras(self) -> None:
         """Build what the scene holds besides the candidates."""
@@ -111,6 +114,22 @@ class SizedTableEnv(BaseEnv):
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
         """The task's predicate, given the indices of the named candidates."""
         raise NotImplementedError
+
+    def _receptacles(self) -> Int[Tensor, "b 3"]:
+        """Index of the place that each candidate was put into, or -1."""
+        return torch.full_like(self._labels, -1)
+
+    def _wrong_receptacle(self, i: int) -> bool:
+        """Whether a place that was not named has been opened or filled in environment `i`."""
+        return False
+
+    def _handles(self) -> list[Link]:
+        """What else the fingers may touch now, besides the candidates."""
+        return []
+
+    def _task_state(self) -> dict[str, Tensor]:
+        """What an episode is besides physics and events, each "b n"; restored in place."""
+        return {"asked": self._asked, "template": self._template}
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         """All keyframes of the expert in environment 0, handling `choice` in order."""
@@ -127,8 +146,8 @@ class SizedTableEnv(BaseEnv):
 
     def slots(self, i: int = 0) -> Slots:
         """Meaning of the instruction of environment `i`."""
-        words = [sizes.LABELS[label] for label in self._asked[i].tolist()]
-        return dict(zip(self.task.slots, words, strict=True))
+        asked = zip(self.task.blanks.items(), self._asked[i].tolist(), strict=True)
+        return {name: words[word] for (name, words), word in asked}
 
     def target_order(self, i: int = 0) -> tuple[int, ...]:
         """Indices of the named candidates of environment `i`, in the order named."""
@@ -170,8 +189,8 @@ class SizedTableEnv(BaseEnv):
         """
         return self._expert_keyframes(choice)[index]
 
-    def expert_target(self, index: int) -> int:
-        """Position in `choice` of the candidate that keyframe `index` serves."""
+    def expert_target(self, index: int) -> int | None:
+        """Position in `choice` of the candidate that keyframe `index` serves, if it serves one."""
         return index * len(self.task.slots) // self.task.keyframes
 
     def outcome(self, i: int = 0) -> Outcome:
@@ -182,11 +201,14 @@ class SizedTableEnv(BaseEnv):
         return Outcome(
             success=bool(result["success_strict"][i]),
             success_lenient=bool(result["success_lenient"][i]),
-            asked=tuple(self.slots(i).values()),
+            asked=self.task.size_words(self.slots(i)),
             handled=tuple(names[k] for k in handled),
+            placed=tuple(names[k] for k in (self._receptacles()[i] >= 0).nonzero()[:, 0].tolist()),
             handled_indices=handled,
             touched=tuple(names[k] for k in _in_order(self.events.touch_order[i])),
             displaced=tuple(names[k] for k in self.events.displaced[i].nonzero()[:, 0].tolist()),
+            wrong_receptacle=self._wrong_receptacle(i),
+            robot_contact_n=max(self.contacts.forces_n.values(), default=0.0),
         )
 
     # ManiSkill's life cycle ----------------------------------------------------------------------
@@ -227,16 +249,12 @@ class SizedTableEnv(BaseEnv):
     def _check_options(self, options: dict[str, Any]) -> None:
         rebuild = self._will_rebuild(options)
         split = options.get("split", "canon" if rebuild else self._split)
-        check_split(self.task, split)
+        wording.check_options(self.task, split, options)
         if split != self._split and not rebuild:
             raise UsageError(
                 f"this environment was built for the split {self._split}, but {split} came; "
                 'add "reconfigure": True to the options.'
             )
-        if "slots" in options:
-            instructions.check_slots(self.task, options["slots"], split)
-        if "template" in options:
-            instructions.check_template(self.task, options["template"])
 
     def _will_rebuild(self, options: dict[str, Any]) -> bool:
         return self.reconfiguration_freq == 1 or options.get("reconfigure", False)
@@ -275,11 +293,12 @@ class SizedTableEnv(BaseEnv):
         self._sizes_m = torch.as_tensor(sizes_m, device=self.device, dtype=torch.float32)
         self._yaw_rad = torch.zeros_like(self._sizes_m)
         self._asked = torch.zeros(
-            (self.num_envs, len(self.task.slots)), dtype=torch.int64, device=self.device
+            (self.num_envs, len(self.task.blanks)), dtype=torch.int64, device=self.device
         )
         self._template = torch.zeros((self.num_envs, 1), dtype=torch.int64, device=self.device)
         self.events = Events.create(self.num_envs, self.device)
         self._sensor = CandidateSensor(self.scene, self.agent, self.candidates, self._touchable())
+        self.contacts = ContactLog(self.scene, self.agent, self._touchable())
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         """Fixed, shadowless light: part of the benchmark's definition."""
@@ -294,6 +313,7 @@ class SizedTableEnv(BaseEnv):
         layouts = [scenes.draw_layout(self.task, seed) for seed in seeds]
         self._say(env_idx, seeds, options)
         self.events.restart(env_idx, self._place_candidates(env_idx, layouts))
+        self.contacts.restart()
         self._place_extras(env_idx, layouts)
         self._variant.place(env_idx, layouts, seeds)
 
@@ -305,9 +325,7 @@ class SizedTableEnv(BaseEnv):
         position = torch.cat([xy_m, height_m[..., None]], dim=-1)
         position[~self._present[env_idx]] += torch.tensor(AWAY_M, device=self.device)
         self._yaw_rad[env_idx] = self._to_tensor([layout.yaw_rad for layout in layouts])
-        half = self._yaw_rad[env_idx] / 2
-        nothing = torch.zeros_like(half)
-        quaternion = torch.stack([half.cos(), nothing, nothing, half.sin()], dim=-1)
+        quaternion = self._rest_quaternions(self._yaw_rad[env_idx])
         for k, candidate in enumerate(self.candidates):
             candidate.set_pose(Pose.create_from_pq(position[:, k], quaternion[:, k]))
         return position
@@ -317,13 +335,14 @@ class SizedTableEnv(BaseEnv):
         for i, seed in zip(env_idx.tolist(), seeds, strict=True):
             drawn, template = wording.draw_meaning(self.task, self._split, seed)
             words = options.get("slots", drawn)
-            asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
+            asked = [known.index(words[name]) for name, known in self.task.blanks.items()]
             self._asked[i] = torch.tensor(asked, device=self.device)
             self._template[i] = options.get("template", template)
         self._find_targets()
 
     def _after_control_step(self) -> None:
         self._update_events()
+        self.contacts.look(self._handles())
 
     def _touch_and_carry(self) -> None:
         forces_n = self._sensor.forces_n()
@@ -363,7 +382,7 @@ class SizedTableEnv(BaseEnv):
 
     def get_state_dict(self) -> dict[str, Any]:
         """Physics, plus the task's own state as ints and floats, each "b n"."""
-        task = {"asked": self._asked.clone(), "template": self._template.clone()}
+        task = {name: value.clone() for name, value in self._task_state().items()}
         return super().get_state_dict() | {"task": task | self.events.state()}
 
     def set_state_dict(self, state: dict[str, Any], env_idx: Tensor | None = None) -> None:
@@ -372,7 +391,7 @@ class SizedTableEnv(BaseEnv):
         if "task" in state:
             if env_idx is None:
                 env_idx = torch.arange(self.num_envs, device=self.device)
-            for name, own in (("asked", self._asked), ("template", self._template)):
+            for name, own in self._task_state().items():
                 saved = torch.as_tensor(state["task"][name], dtype=own.dtype, device=self.device)
                 own[env_idx] = saved.view(-1, own.shape[1])
             self.events.set_state(state["task"], env_idx)
@@ -396,7 +415,8 @@ class SizedTableEnv(BaseEnv):
 
     def _find_targets(self) -> None:
         """Resolve the words into candidates; called when words change."""
-        named = self._labels[:, None] == self._asked[..., None]
+        sizes_asked = self._asked[:, : len(self.task.slots)]
+        named = self._labels[:, None] == sizes_asked[..., None]
         self._targets = named.int().argmax(-1)
         self._present = self._variant.present(named.any(1))
         self._unnamed = ~named.any(1) & self._present
@@ -413,22 +433,6 @@ class SizedTableEnv(BaseEnv):
         """Position (world, m) and heading (rad) of candidate `k` of environment 0 at reset."""
         position = self.events.start[0, k].cpu().numpy().astype(np.float64)
         return position, float(self._yaw_rad[0, k])
-
-    def _downwards(
-        self,
-        xyz_in_world_m: np.ndarray,
-        yaw_rad: float,
-        *,
-        gripper_open: bool,
-        ignore_collisions: bool,
-    ) -> Keyframe:
-        """Keyframe with the gripper pointing down and its closing axis turned by `yaw_rad`."""
-        return Keyframe(
-            position_m=np.asarray(xyz_in_world_m, dtype=np.float64) - BASE_IN_WORLD_M,
-            quaternion_wxyz=np.array([0.0, np.cos(yaw_rad / 2), np.sin(yaw_rad / 2), 0.0]),
-            gripper_open=gripper_open,
-            ignore_collisions=ignore_collisions,
-        )
 
 
 def _in_order(order: Int[Tensor, "3"]) -> tuple[int, ...]:

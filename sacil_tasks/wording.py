@@ -5,11 +5,32 @@ or say what is not meant.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
-from sacil_tasks.instructions import Slots, draw_words, render, variations
+from sacil_tasks.instructions import (
+    Slots,
+    check_slots,
+    check_template,
+    draw_words,
+    render,
+    variations,
+)
 from sacil_tasks.scenes import stream
 from sacil_tasks.spec import TaskSpec
-from sacil_tasks.splits import SPLITS
+from sacil_tasks.splits import SPLITS, check_split
+
+
+def check_options(task: TaskSpec, split: str, options: Mapping[str, Any]) -> None:
+    """Accept a split, and the slots and template among the options of a reset.
+
+    Raises:
+        UsageError: one of them does not belong to the task.
+    """
+    check_split(task, split)
+    if "slots" in options:
+        check_slots(task, options["slots"], split)
+    if "template" in options:
+        check_template(task, options["template"])
 
 
 def draw_meaning(task: TaskSpec, split: str, seed: int) -> tuple[Slots, int]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards
 from sacil_tasks.scenes import Layout
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
@@ -82,8 +83,8 @@ class PickAndLiftEnv(SizedTableEnv):
         lift = grasp + np.array([0, 0, 0.10])
         goal = self.goal.pose.p[0].cpu().numpy() + np.array([0, 0, grasp[2] - edge_m / 2])
         return [
-            self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
-            self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(goal, yaw, gripper_open=False, ignore_collisions=False),
+            downwards(above, yaw, gripper_open=True, ignore_collisions=False),
+            downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(goal, yaw, gripper_open=False, ignore_collisions=False),
         ]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
 
@@ -83,7 +84,7 @@ class PickUpCupEnv(SizedTableEnv):
         above = np.array([at[0], at[1], height_m + 0.08])
         lift = grasp + np.array([0, 0, 0.20])
         return [
-            self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
-            self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(above, yaw, gripper_open=True, ignore_collisions=False),
+            downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
         ]

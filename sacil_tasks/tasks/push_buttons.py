@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards
 from sacil_tasks.scenes import Layout
 from sacil_tasks.sizes import CANDIDATES
 from sacil_tasks.spec import TaskSpec
@@ -108,8 +109,8 @@ class PushButtonsEnv(SizedTableEnv):
             (x, y, _), _ = self._start_pose(k)
             above, press = np.array([x, y, 0.10]), np.array([x, y, 0.0395])
             keyframes += [
-                self._downwards(above, 0.0, gripper_open=False, ignore_collisions=False),
-                self._downwards(press, 0.0, gripper_open=False, ignore_collisions=True),
-                self._downwards(above, 0.0, gripper_open=False, ignore_collisions=True),
+                downwards(above, 0.0, gripper_open=False, ignore_collisions=False),
+                downwards(press, 0.0, gripper_open=False, ignore_collisions=True),
+                downwards(above, 0.0, gripper_open=False, ignore_collisions=True),
             ]
         return keyframes

@@ -66,7 +66,7 @@ def test_wrong_slots_are_explained(slots: dict, message: str) -> None:
 
 
 def test_one_word_for_two_slots_is_refused() -> None:
-    with pytest.raises(UsageError, match="another size word"):
+    with pytest.raises(UsageError, match="each size with another word"):
         instructions.check_slots(task_spec("push_buttons"), {"first": "small", "second": "small"})
 
 

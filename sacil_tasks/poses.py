@@ -1,0 +1,55 @@
+"""Poses by heading: of things that stand, and of the gripper in the expert's keyframes.
+
+Keyframes are asked for in the world frame and given in the base frame.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sacil_tasks.interface import Keyframe
+
+BASE_IN_WORLD_M = (-0.615, 0.0, 0.0)
+"""Where the robot stands; base and world axes are parallel."""
+
+
+def upright(yaw_rad: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4"]:
+    """Quaternions (wxyz) of things that stand on the table with these headings."""
+    nothing = torch.zeros_like(yaw_rad)
+    return torch.stack([(yaw_rad / 2).cos(), nothing, nothing, (yaw_rad / 2).sin()], dim=-1)
+
+
+def downwards(
+    xyz_in_world_m: Float64[np.ndarray, "3"],
+    yaw_rad: float,
+    *,
+    gripper_open: bool,
+    ignore_collisions: bool,
+) -> Keyframe:
+    """Keyframe with the gripper pointing down; at yaw 0 it closes along y."""
+    return Keyframe(
+        position_m=np.asarray(xyz_in_world_m, dtype=np.float64) - BASE_IN_WORLD_M,
+        quaternion_wxyz=np.array([0.0, np.cos(yaw_rad / 2), np.sin(yaw_rad / 2), 0.0]),
+        gripper_open=gripper_open,
+        ignore_collisions=ignore_collisions,
+    )
+
+
+def sideways(
+    xyz_in_world_m: Float64[np.ndarray, "3"],
+    heading_rad: float,
+    *,
+    gripper_open: bool,
+    ignore_collisions: bool,
+) -> Keyframe:
+    """Keyframe with the gripper pointing horizontally along `heading_rad`, closing vertically."""
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    axes = np.array([[-sine, 0.0, cosine], [cosine, 0.0, sine], [0.0, 1.0, 0.0]])
+    return Keyframe(
+        position_m=np.asarray(xyz_in_world_m, dtype=np.float64) - BASE_IN_WORLD_M,
+        quaternion_wxyz=Rotation.from_matrix(axes).as_quat(scalar_first=True),
+        gripper_open=gripper_open,
+        ignore_collisions=ignore_collisions,
+    )
