@@ -76,7 +76,9 @@ def largest_m(family: SizeFamily, ratio: float) -> float:
     return _middle_m(family) * ratio * _COMMON_JITTER[1] * _OWN_JITTER[1]
 
 
-def absolute_choice(family: str, label: str, sizes_m: Sequence[float]) -> int:
+def absolute_choice(
+    family: str, label: str, sizes_m: Sequence[float] | Float64[np.ndarray, "k"]
+) -> int:
     """Which of the objects is nearest to the size that `label` had in training.
 
     What a policy takes that has learnt sizes instead of ranks: right in `canon`, wrong wherever

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -273,7 +273,7 @@ class SizedTableEnv(BaseEnv):
         ]
         self._load_extras()
         self._variant.build(self.scene)
-        self._create_state(self._variant.labels, sizes_m)
+        self._create_state()
 
     def _build_batch(
         self, k: int, sizes_m: Float64[np.ndarray, "b"], rgbs: list[Float64[np.ndarray, "3"]]
@@ -285,12 +285,10 @@ class SizedTableEnv(BaseEnv):
 
         return props.build_each(self.scene, f"candidate_{k}", build)
 
-    def _create_state(
-        self, labels: Int64[np.ndarray, "b 3"], sizes_m: Float64[np.ndarray, "b 3"]
-    ) -> None:
+    def _create_state(self) -> None:
         """Allocate what belongs to the task and is not physics."""
-        self._labels = torch.as_tensor(labels, device=self.device)
-        self._sizes_m = torch.as_tensor(sizes_m, device=self.device, dtype=torch.float32)
+        self._labels = torch.as_tensor(self._variant.labels, device=self.device)
+        self._sizes_m = self._to_tensor(list(self._variant.sizes_m))
         self._yaw_rad = torch.zeros_like(self._sizes_m)
         self._asked = torch.zeros(
             (self.num_envs, len(self.task.blanks)), dtype=torch.int64, device=self.device

@@ -19,6 +19,7 @@ from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import variations
 from sacil_tasks.interface import SCENE_BOUNDS
 from sacil_tasks.scenes import scene_seed
+from sacil_tasks.splits import SPLITS
 from sacil_tasks.table import HOME_QPOS, SizedTableEnv
 
 pytestmark = pytest.mark.sim
@@ -116,20 +117,61 @@ def test_words_change_nothing_but_words(env: SizedTableEnv) -> None:
     assert len(targets) == len(choices)
 
 
-def test_splits_change_sizes_and_heights_only(env: SizedTableEnv) -> None:
+def test_splits_move_no_candidate_and_change_no_order_of_sizes(env: SizedTableEnv) -> None:
     _state(env, 5)
-    canon, place = env.sizes_m, env.candidate_in_base()
+    canon_m, place = env.sizes_m, env.candidate_in_base()
     for split in env.task.splits:
         env.reset(seed=5, options={"split": split})
-        steps = sizes.FIRST_RUNG[split] - sizes.FIRST_RUNG["canon"]
-        assert np.all(np.sign(env.sizes_m - canon) == np.sign(steps))
-        assert np.array_equal(env.candidate_in_base()[:, :2], place[:, :2])
-        assert np.argsort(env.sizes_m).tolist() == np.argsort(canon).tolist()
+        there = env.candidate_in_base()[:, 2] > -1
+        assert np.array_equal(env.candidate_in_base()[there, :2], place[there, :2])
+        assert np.argsort(env.sizes_m).tolist() == np.argsort(canon_m).tolist()
+        if split.startswith("shift"):
+            assert np.all(np.sign(env.sizes_m - canon_m) == (1 if split == "shift_up" else -1))
+        elif SPLITS[split].ratio is None and split != "mixed":
+            assert np.array_equal(env.sizes_m, canon_m)
+
+
+def test_objects_left_out_are_out_of_reach_and_never_count(env: SizedTableEnv) -> None:
+    for split in {"pair", "single_object"} & set(env.task.splits):
+        env.reset(seed=5, options={"split": split})
+        there = env.candidate_in_base()[:, 2] > -1
+        assert there.sum() == (2 if split == "pair" else 1)
+        assert all(there[k] for k in env.target_order())
+        info = _hold(env, 40)
+        assert not info["success_lenient"].any()
+        assert not (env.events.displaced & env._unnamed).any()  # noqa: SLF001
+
+
+def test_clutter_is_of_another_kind_and_stands_clear(env: SizedTableEnv) -> None:
+    if "clutter" not in env.task.splits:
+        pytest.skip(f"{env.task.name} has no clutter")
+    for seed in range(4):
+        env.reset(seed=seed, options={"split": "clutter"})
+        before = env.clutter_in_base()
+        gaps_m = np.linalg.norm(before[:, :2] - env.candidate_in_base()[:, :2], axis=-1)
+        assert gaps_m.min() > 0.1
+        _hold(env, 20)
+        assert np.abs(env.clutter_in_base() - before).max() < 1e-3
+    env.reset(seed=0)
+    assert not len(env.clutter_in_base())
+
+
+def test_every_split_says_what_the_registry_says(env: SizedTableEnv) -> None:
+    words = {}
+    for split in env.task.splits:
+        env.reset(seed=5, options={"split": split})
+        (words[split],) = env.get_language_instruction()
+    assert words["blank_text"] == ""
+    assert words["canon"] == words["shift_down"] == words["fine_110"] == words["clutter"]
+    assert "er " in words["pair"]
+    assert not set(words["unique_colour"].split()) & set(sizes.LABELS)
+    held_out = {words["para_size"], words["para_verb"], words["para_both"]}
+    assert len(held_out | {words["canon"]}) == 4
 
 
 def test_unsupported_splits_and_options_are_refused(env: SizedTableEnv) -> None:
-    for split in set(sizes.SPLITS) - set(env.task.splits):
-        with pytest.raises(UsageError, match=f"no split of {env.task.name}"):
+    for split in set(SPLITS) - set(env.task.splits):
+        with pytest.raises(UsageError, match=f"{env.task.name} has no split {split}"):
             env.reset(seed=1, options={"split": split})
     for options in ({"split": "shift_dwon"}, {"slots": {"size": "tiny"}}, {"template": 99}):
         with pytest.raises(UsageError):
