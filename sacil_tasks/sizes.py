@@ -30,7 +30,7 @@ class SizeFamily:
     """One ladder of sizes in metres, smallest first."""
 
     rungs_m: tuple[float, ...]
-    """Edge of a block, outer diameter of a cup, cap diameter of a button."""
+    """Edge of a block, outer diameter of a cup, width of a pepper, cap diameter of a button."""
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -43,9 +43,11 @@ class SizeFamily:
 FAMILIES = {
     "block": SizeFamily((0.022, 0.029, 0.038, 0.050, 0.065)),
     "cup": SizeFamily((0.031, 0.0395, 0.050, 0.063)),
+    "pepper": SizeFamily((0.030, 0.038, 0.048, 0.061)),
     "button": SizeFamily((0.018, 0.025, 0.035, 0.049, 0.068)),
 }
-"""Adjacent ratios 1.31, 1.265 and 1.40; the largest cup still fits the open gripper (80 mm)."""
+"""Adjacent ratios 1.31, 1.265, 1.265 and 1.40; the largest cup still fits the
+open gripper (80 mm)."""
 
 
 def draw_jitter(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:
