@@ -86,6 +86,19 @@ def cup_height_m(diameter_m: Length) -> Length:
     return 1.3 * diameter_m
 
 
+def cup_grasp_m(height_m: float) -> float:
+    """Height above its lower end at which the gripper closes on a cup, from above."""
+    return max(height_m - 0.025, height_m / 2)
+
+
+def cup_grasp_yaw(heading_rad: float) -> float:
+    """Gripper yaw that closes across the handle, on two flat facets of the wall.
+
+    Of the two, half a turn apart, the one in (-90, 90] degrees.
+    """
+    return np.pi / 2 - (np.pi / 2 - heading_rad) % np.pi
+
+
 def build_cup(scene: ManiSkillScene, index: int, name: str, diameter_m: float, rgb: Rgb) -> Actor:
     """Hollow upright cup, origin at the middle of its height, handle towards +x.
 
