@@ -1,7 +1,8 @@
 """Tasks that put what is named somewhere: what they share beyond the table."""
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from torch import Tensor
 
@@ -36,6 +37,16 @@ class PlacingEnv(SizedTableEnv):
     def _belongs(self, places: Int[Tensor, "b 3"]) -> Bool[Tensor, "b 3"]:
         """Whether a candidate that lies in a place (-1: in none) is where a named one should be."""
         return places >= 0
+
+    def _on_fixture(self, point_m: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+        """A point of the fixture's frame in the world, in environment 0."""
+        matrix = self.fixture.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)
+        return matrix[:3, :3] @ point_m + matrix[:3, 3]
+
+    def _fixture_yaw(self) -> float:
+        """Heading of the fixture (rad) in environment 0."""
+        ahead = self._on_fixture(np.array([1.0, 0.0, 0.0])) - self._on_fixture(np.zeros(3))
+        return float(np.arctan2(ahead[1], ahead[0]))
 
 
 def seen_from(

@@ -31,7 +31,7 @@ class SizeFamily:
     """One ladder of sizes in metres, smallest first."""
 
     rungs_m: tuple[float, ...]
-    """Edge of a block, outer diameter of a cup, cap diameter of a button."""
+    """Edge of a block, outer diameter of a cup, width of a pepper, cap diameter of a button."""
 
     def first_rungs(self, wanted: Sequence[int]) -> tuple[int, ...]:
         """Those of `wanted` from which three rungs can be taken."""

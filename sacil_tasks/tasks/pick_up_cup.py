@@ -78,9 +78,8 @@ class PickUpCupEnv(SizedTableEnv):
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         height_m = props.cup_height_m(self.sizes_m[choice[0]])
         at, heading = self._start_pose(choice[0])
-        # Closing across the handle and on two flat facets of the wall; a half turn is the same.
-        yaw = np.pi / 2 - (np.pi / 2 - heading) % np.pi
-        grasp = np.array([at[0], at[1], max(height_m - 0.025, height_m / 2)])
+        yaw = props.cup_grasp_yaw(heading)
+        grasp = np.array([at[0], at[1], props.cup_grasp_m(height_m)])
         above = np.array([at[0], at[1], height_m + 0.08])
         lift = grasp + np.array([0, 0, 0.20])
         return [
