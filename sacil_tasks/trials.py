@@ -5,10 +5,11 @@
 
 import hashlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from sacil_tasks.audit import Trial
 from sacil_tasks.episode import SceneKey, Stage
 from sacil_tasks.instructions import Slots, variations
 from sacil_tasks.interface import CAMERAS
@@ -16,23 +17,12 @@ from sacil_tasks.scenes import draw_geometry, scene_seed
 from sacil_tasks.sizes import LABELS
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import HOME_QPOS, SizedTableEnv
+from sacil_tasks.verdicts import Row
 
 HELD_SEEDS = 500
 """Seeds whose scene is also left alone for a moment."""
 
 _HOLD_STEPS = 5
-
-Row = dict[str, Any]
-
-
-class Trial(NamedTuple):
-    """Some scenes of one check."""
-
-    check: str
-    task: str
-    split: str
-    start: int
-    scenes: int
 
 
 class Auditor:
@@ -99,8 +89,14 @@ def expert_row(stage: Stage, split: str, index: int) -> Row:
     for number, slots in enumerate(variations(stage.spec, split)):
         stage.begin(scene, variation=number, split=split)
         refusal = play(stage, stage.expert_keyframe)
-        code = "REFUSED" if refusal else stage.outcome().code
-        episodes.append({"asked": stage.spec.size_words(slots), "code": code})
+        outcome = stage.outcome()
+        episodes.append(
+            {
+                "asked": stage.spec.size_words(slots),
+                "clean": refusal is None and outcome.clean,
+                "code": refusal or outcome.code,
+            }
+        )
     return {"rejected": stage.attempt, "episodes": episodes}
 
 
@@ -188,7 +184,7 @@ def _flat(numbers: dict[str, Any]) -> list[float]:
 
 
 _CHECKS: dict[str, Callable[[Stage, str, int], Row]] = {
-    "resets": reset_row,
+    "shortcuts": reset_row,
     "looks": look_row,
     "expert": expert_row,
     "scripts": script_row,
