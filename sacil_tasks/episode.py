@@ -151,7 +151,9 @@ class Stage:
         """The first attempt that the expert can plan; it has been reset."""
         for attempt in range(ATTEMPTS):
             self._reset(scene, attempt, slots, template, "canon")
-            if all(self._can_plan(choice) for choice in self._choices()):
+            feasible = all(self._can_plan(words) for words in variations(self.spec))
+            self.env.ask(slots)
+            if feasible:
                 return attempt
         raise RuntimeError(f"the expert can plan none of the {ATTEMPTS} attempts of {scene}")
 
@@ -167,13 +169,9 @@ class Stage:
         self._executor.begin()
         self._steps, self._gripper_open = 0, True
 
-    def _choices(self) -> list[tuple[int, ...]]:
-        """Candidates that each variation names."""
-        holder = {label: i for i, label in enumerate(self.env.candidate_labels)}
-        return [tuple(holder[w] for w in slots.values()) for slots in variations(self.spec)]
-
-    def _can_plan(self, choice: tuple[int, ...]) -> bool:
-        keyframes = [self.expert_keyframe(k, choice) for k in range(self.spec.keyframes)]
+    def _can_plan(self, words: Slots) -> bool:
+        self.env.ask(words)
+        keyframes = [self.expert_keyframe(k) for k in range(self.spec.keyframes)]
         return self._executor.plan_sequence(keyframes) is None
 
 

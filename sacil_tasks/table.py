@@ -148,6 +148,17 @@ class SizedTableEnv(BaseEnv):
         asked = zip(self.task.blanks.items(), self._asked[i].tolist(), strict=True)
         return {name: words[word] for (name, words), word in asked}
 
+    def ask(self, slots: Slots) -> None:
+        """Change what the instruction means, and nothing else.
+
+        Raises:
+            UsageError: the slots do not belong to the task.
+        """
+        instructions.check_slots(self.task, slots)
+        words = [known.index(slots[name]) for name, known in self.task.blanks.items()]
+        self._asked[:] = torch.tensor(words, device=self.device)
+        self._find_targets()
+
     def target_order(self, i: int = 0) -> tuple[int, ...]:
         """Indices of the named candidates of environment `i`, in the order named."""
         return tuple(self._targets[i].tolist())

@@ -100,7 +100,8 @@ class KeyframeExecutor:
     def plan_sequence(self, keyframes: Sequence[Keyframe]) -> Refusal | None:
         """Whether all keyframes can be reached one after the other, without simulation.
 
-        A movable body between the closing fingers goes with the hand until they open.
+        What is between the closing fingers goes with the hand until they open: a movable body
+        wherever it goes, a drawer as far as it slides.
         """
         state, gripper_open = self.state(), self._gripper_open
         for keyframe in keyframes:
@@ -136,17 +137,24 @@ class KeyframeExecutor:
 
     def _after(self, state: MotionState, joints: Joints) -> MotionState:
         bodies = list(state.bodies_in_base)
+        before, after = self._arm.tcp_in_base(state.joints), self._arm.tcp_in_base(joints)
         if state.held is not None:
-            moved = self._arm.tcp_in_base(joints) * self._arm.tcp_in_base(state.joints).inverse()
-            bodies[state.held] = moved * bodies[state.held]
+            bodies[state.held] = after * before.inverse() * bodies[state.held]
+        if state.pulled is not None:
+            pose = bodies[state.pulled]
+            axis = pose.rotation @ self.world.bodies[state.pulled].slides_along
+            shift = axis * (axis @ (after.translation - before.translation))
+            bodies[state.pulled] = pin.SE3(pose.rotation, pose.translation + shift)
         return replace(state, joints=joints, bodies_in_base=tuple(bodies))
 
     def _with_gripper(self, state: MotionState, *, gripper_open: bool) -> MotionState:
         if gripper_open:
-            return replace(state, finger_m=OPEN_M, held=None)
+            return replace(state, finger_m=OPEN_M, held=None, pulled=None)
         # The fingers stay apart in the plan: wider than they will be, so on the safe side.
         held = self.world.body_between_fingers(state)
-        return replace(state, held=held, finger_m=0.0 if held is None else state.finger_m)
+        if held is not None:
+            return replace(state, held=held)
+        return replace(state, finger_m=0.0, pulled=self.world.drawer_between_fingers(state))
 
     def _without_lag(self, motion: JointPath) -> JointPath:
         """Targets that make the joints be where they should be after each control step.
