@@ -151,9 +151,9 @@ class Stage:
         """The first attempt that the expert can plan; it has been reset."""
         for attempt in range(ATTEMPTS):
             self._reset(scene, attempt, slots, template, "canon")
-            feasible = all(self._can_plan(words) for words in variations(self.spec))
+            refusal = self._executor.plan_sequences(map(self._expert, variations(self.spec)))
             self.env.ask(slots)
-            if feasible:
+            if refusal is None:
                 return attempt
         raise RuntimeError(f"the expert can plan none of the {ATTEMPTS} attempts of {scene}")
 
@@ -169,10 +169,10 @@ class Stage:
         self._executor.begin()
         self._steps, self._gripper_open = 0, True
 
-    def _can_plan(self, words: Slots) -> bool:
+    def _expert(self, words: Slots) -> list[Keyframe]:
+        """All keyframes of the expert if `words` were asked for."""
         self.env.ask(words)
-        keyframes = [self.expert_keyframe(k) for k in range(self.spec.keyframes)]
-        return self._executor.plan_sequence(keyframes) is None
+        return [self.expert_keyframe(k) for k in range(self.spec.keyframes)]
 
 
 def _make(task: str, *, render: bool) -> gym.Env:

@@ -24,6 +24,15 @@ def upright(yaw_rad: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4"]:
     return torch.stack([(yaw_rad / 2).cos(), nothing, nothing, (yaw_rad / 2).sin()], dim=-1)
 
 
+def grasp_height_m(height_m: float) -> float:
+    """How far above its foot the gripper, from above, takes a thing of this height.
+
+    At the middle; but the palm stays off its top, and the fingertips, which reach 9.5 mm below the
+    tool centre, off what it stands on, with room for the 5 mm that the arm may overshoot.
+    """
+    return max(height_m / 2, height_m - 0.025, 0.0165)
+
+
 def roomy_yaw(heading_rad: float, others_m: Float64[np.ndarray, "n 2"]) -> float:
     """Gripper yaw that closes on a four-sided thing with the palm far from the others.
 

@@ -1,6 +1,6 @@
 """From keyframes to control steps: plan, move, then the gripper acts, then everything settles."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -42,6 +42,14 @@ class Plan:
 
     motion: JointPath
     """Where the joints should be after each control step."""
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    """What a sequence of keyframes leads to."""
+
+    state: MotionState
+    gripper_open: bool
 
 
 class KeyframeExecutor:
@@ -98,20 +106,26 @@ class KeyframeExecutor:
         return None
 
     def plan_sequence(self, keyframes: Sequence[Keyframe]) -> Refusal | None:
-        """Whether all keyframes can be reached one after the other, without simulation.
+        """Whether all keyframes can be reached one after the other, without simulation."""
+        return self.plan_sequences([keyframes])
+
+    def plan_sequences(self, sequences: Iterable[Sequence[Keyframe]]) -> Refusal | None:
+        """Whether every sequence can be followed from here; common beginnings are planned once.
 
         What is between the closing fingers goes with the hand until they open: a movable body
         wherever it goes, a drawer as far as it slides.
         """
-        state, gripper_open = self.state(), self._gripper_open
-        for keyframe in keyframes:
-            path = self._path(keyframe, state)
-            if isinstance(path, Refusal):
-                return path
-            state = self._after(state, path[-1])
-            if keyframe.gripper_open != gripper_open:
-                state = self._with_gripper(state, gripper_open=keyframe.gripper_open)
-                gripper_open = keyframe.gripper_open
+        here = _Ahead(self.state(), self._gripper_open)
+        known: dict[tuple[bytes, ...], _Ahead] = {}
+        for keyframes in sequences:
+            ahead = here
+            done: tuple[bytes, ...] = ()
+            for keyframe in keyframes:
+                done = (*done, _fingerprint(keyframe))
+                reached = known.get(done) or self._reach(keyframe, ahead)
+                if isinstance(reached, Refusal):
+                    return reached
+                known[done] = ahead = reached
         return None
 
     def state(self) -> MotionState:
@@ -134,6 +148,15 @@ class KeyframeExecutor:
         if isinstance(target, Refusal):
             return target
         return self._planner.path(state, target, ignore_obstacles=keyframe.ignore_collisions)
+
+    def _reach(self, keyframe: Keyframe, ahead: _Ahead) -> _Ahead | Refusal:
+        path = self._path(keyframe, ahead.state)
+        if isinstance(path, Refusal):
+            return path
+        state = self._after(ahead.state, path[-1])
+        if keyframe.gripper_open != ahead.gripper_open:
+            state = self._with_gripper(state, gripper_open=keyframe.gripper_open)
+        return _Ahead(state, keyframe.gripper_open)
 
     def _after(self, state: MotionState, joints: Joints) -> MotionState:
         bodies = list(state.bodies_in_base)
@@ -191,6 +214,11 @@ class KeyframeExecutor:
 
     def _positions(self) -> Float64[np.ndarray, "9"]:
         return self._base.agent.robot.get_qpos()[0].numpy().astype(float)
+
+
+def _fingerprint(keyframe: Keyframe) -> bytes:
+    flags = bytes([keyframe.gripper_open, keyframe.ignore_collisions])
+    return keyframe.position_m.tobytes() + keyframe.quaternion_wxyz.tobytes() + flags
 
 
 def _to_pose(keyframe: Keyframe) -> pin.SE3 | Refusal:

@@ -12,7 +12,7 @@ from sacil_tasks import fixtures, props
 from sacil_tasks.events import append_order
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.placing import PlacingEnv, seen_from
-from sacil_tasks.poses import downwards, sideways
+from sacil_tasks.poses import downwards, grasp_height_m, sideways
 from sacil_tasks.scenes import Layout
 from sacil_tasks.spec import Fixture, TaskSpec
 
@@ -185,8 +185,7 @@ class PutItemInDrawerEnv(PlacingEnv):
     def _put_in(self, k: int, beside_m: float) -> list[Keyframe]:
         """Take item `k` off the cabinet and let it down, `beside_m` off the drawer's middle."""
         (x, y, _), edge_m = self._start_pose(k)[0], float(self.sizes_m[k])
-        # At the middle, but with the fingers off the cabinet and the palm off the item.
-        grasp_m = max(edge_m / 2, edge_m - 0.025, 0.0115)
+        grasp_m = grasp_height_m(edge_m)
         yaw, row_yaw = self._roomy_yaw(k), self._row_yaw()
         high, low = np.array([x, y, CARRY_M]), np.array([x, y, fixtures.CABINET_TOP_M + grasp_m])
         over = self._on_fixture(np.array([OPENING_M - DROP_M, beside_m, CARRY_M]))

@@ -10,7 +10,7 @@ from torch import Tensor
 from sacil_tasks import fixtures, props
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.placing import PlacingEnv, seen_from
-from sacil_tasks.poses import downwards
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.spec import Fixture, TaskSpec
 
 SPEC = TaskSpec(
@@ -89,8 +89,7 @@ class TakeOffPepperEnv(PlacingEnv):
         for k, spot_m in zip(choice, DROP_XY_M, strict=False):
             (x, y, _), _ = self._start_pose(k)
             yaw, height_m = self._roomy_yaw(k), props.pepper_height_m(self.sizes_m[k])
-            # At the middle, or as high as keeps the palm off its top.
-            grasp_m = max(height_m / 2, height_m - 0.025)
+            grasp_m = grasp_height_m(height_m)
             high, low = np.array([x, y, 0.30]), np.array([x, y, fixtures.PAN_TOP_M + grasp_m])
             # Closing along x, so that the palm stays clear of a pepper set down before.
             over, down = np.array([*spot_m, 0.25]), np.array([*spot_m, grasp_m + 0.006])
