@@ -336,7 +336,9 @@ class SizedTableEnv(BaseEnv):
 
     def _after_control_step(self) -> None:
         self._update_events()
-        self.contacts.look(self._handles())
+
+    def _after_simulation_step(self) -> None:
+        self.contacts.look(self._handles)
 
     def _touch_and_carry(self) -> None:
         forces_n = self._sensor.forces_n()

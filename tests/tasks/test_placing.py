@@ -19,6 +19,7 @@ from sacil_tasks.tasks.put_item_in_drawer import OPENING_M, PutItemInDrawerEnv
 pytestmark = pytest.mark.sim
 
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
+UP = np.array([0.0, 0.0, 1.0])
 DRAWERS = tuple(fixtures.HANDLE_HEIGHTS_M)
 
 
@@ -89,7 +90,7 @@ def test_a_cup_beside_its_peg_or_upright_is_not_placed(cups: PlacingEnv) -> None
     first, second = cups.target_order()
     beside_m = float(cups.sizes_m[first]) / 2 + 0.01
     _put(cups, first, _over_peg(cups, first, 2, -beside_m), UPSIDE_DOWN)
-    _put(cups, second, _over_peg(cups, second, 0) + [0, 0, 0.033])
+    _put(cups, second, _over_peg(cups, second, 0) + UP * 0.033)
     assert not _settled(cups).placed
     assert cups.outcome().code == "MOTOR_FAIL"
 
@@ -112,7 +113,7 @@ def test_peppers_count_on_the_table_but_neither_on_the_pan_nor_below(peppers: Pl
     ahead = -0.3 if np.cos(peppers._fixture_yaw()) < 0 else 0.3  # noqa: SLF001
     assert not peppers.outcome().placed
     _put(peppers, first, _beside_pan(peppers, first, ahead))
-    _put(peppers, second, _beside_pan(peppers, second, ahead) + [0, 0, -0.2])
+    _put(peppers, second, _beside_pan(peppers, second, ahead) - UP * 0.2)
     assert peppers._receptacles()[0].tolist().count(0) == 1  # noqa: SLF001
     _put(peppers, second, _beside_pan(peppers, second, 1.5 * ahead))
     assert _settled(peppers).code == "SUCCESS"
@@ -183,7 +184,7 @@ def test_only_fingers_on_candidates_and_the_named_handle_are_clean(items: Placin
         items.step(np.array([*HOME_QPOS[:7], -1.0], dtype=np.float32))
     assert items.events.grasped[0, 0]
     assert not items.contacts.forces_n
-    items.candidates[1].set_pose(sapien.Pose(tcp.p + [0, 0, 0.05]))
+    items.candidates[1].set_pose(sapien.Pose(tcp.p + UP * 0.05))
     _hold(items, 1)
     touched = {link for link, thing in items.contacts.forces_n if "candidate_1" in thing}
     assert "panda_hand" in touched
