@@ -1,6 +1,6 @@
 """What the robot bumps into: an expert is clean only if it touches nothing it need not touch."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from mani_skill.agents.robots import Panda
@@ -16,7 +16,7 @@ _BASE_LINK = "panda_link0"
 
 
 class ContactLog:
-    """Unwanted contacts since `restart`, read after each control step.
+    """Unwanted contacts since `restart`, read after each step of the simulation.
 
     Fingers may touch what a task lets them touch; nothing else of the robot may touch anything.
     Contacts can be listed on the CPU only; on the GPU the log stays empty.
@@ -38,8 +38,8 @@ class ContactLog:
         """Forget the last episode."""
         self.forces_n.clear()
 
-    def look(self, handles: Sequence[Link]) -> None:
-        """Take in the contacts now; fingers may touch `handles` too."""
+    def look(self, handles: Callable[[], Sequence[Link]]) -> None:
+        """Take in the contacts now; fingers may touch `handles` too, asked for where it matters."""
         if self._scene.gpu_sim_enabled:
             return
         for contact in self._scene.get_contacts():
@@ -47,7 +47,7 @@ class ContactLog:
             if (first in self._robot) == (second in self._robot):
                 continue
             link, thing = (first, second) if first in self._robot else (second, first)
-            if link in self._fingers and thing in self._touchable | _bodies(handles):
+            if link in self._fingers and thing in self._touchable | _bodies(handles()):
                 continue
             self._note(link.entity.name, thing.entity.name, contact)
 

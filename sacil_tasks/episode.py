@@ -152,7 +152,9 @@ class Stage:
         """The first attempt that the expert can plan; it has been reset."""
         for attempt in range(ATTEMPTS):
             self._reset(scene, attempt, slots, template, "canon")
-            if all(self._can_plan(choice) for choice in self._choices()):
+            refusal = self._executor.plan_sequences(map(self._expert, variations(self.spec)))
+            self.env.ask(slots)
+            if refusal is None:
                 return attempt
         raise RuntimeError(f"the expert can plan none of the {ATTEMPTS} attempts of {scene}")
 
@@ -168,14 +170,10 @@ class Stage:
         self._executor.begin()
         self._steps, self._gripper_open = 0, True
 
-    def _choices(self) -> list[tuple[int, ...]]:
-        """Candidates that each variation names."""
-        holder = {label: i for i, label in enumerate(self.env.candidate_labels)}
-        return [tuple(holder[w] for w in slots.values()) for slots in variations(self.spec)]
-
-    def _can_plan(self, choice: tuple[int, ...]) -> bool:
-        keyframes = [self.expert_keyframe(k, choice) for k in range(self.spec.keyframes)]
-        return self._executor.plan_sequence(keyframes) is None
+    def _expert(self, words: Slots) -> list[Keyframe]:
+        """All keyframes of the expert if `words` were asked for."""
+        self.env.ask(words)
+        return [self.expert_keyframe(k) for k in range(self.spec.keyframes)]
 
 
 def _make(task: str, *, render: bool) -> gym.Env:

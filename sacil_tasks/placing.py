@@ -6,8 +6,9 @@ from jaxtyping import Bool, Float, Float64, Int
 from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from torch import Tensor
 
-from sacil_tasks.poses import upright
+from sacil_tasks.poses import roomy_yaw, upright
 from sacil_tasks.scenes import Layout
+from sacil_tasks.sizes import CANDIDATES
 from sacil_tasks.table import SizedTableEnv
 
 
@@ -37,6 +38,13 @@ class PlacingEnv(SizedTableEnv):
     def _belongs(self, places: Int[Tensor, "b 3"]) -> Bool[Tensor, "b 3"]:
         """Whether a candidate that lies in a place (-1: in none) is where a named one should be."""
         return places >= 0
+
+    def _roomy_yaw(self, k: int) -> float:
+        """Gripper yaw for candidate `k` of environment 0, away from the other two."""
+        (here, heading), *others = [
+            self._start_pose(i % CANDIDATES) for i in range(k, k + CANDIDATES)
+        ]
+        return roomy_yaw(heading, np.array([position[:2] - here[:2] for position, _ in others]))
 
     def _on_fixture(self, point_m: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         """A point of the fixture's frame in the world, in environment 0."""

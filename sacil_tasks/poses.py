@@ -14,11 +14,39 @@ from sacil_tasks.interface import Keyframe
 BASE_IN_WORLD_M = (-0.615, 0.0, 0.0)
 """Where the robot stands; base and world axes are parallel."""
 
+_PALM_REACH_M = (0.102, 0.0315)
+"""Half extents of the palm along and across the closing axis."""
+
 
 def upright(yaw_rad: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4"]:
     """Quaternions (wxyz) of things that stand on the table with these headings."""
     nothing = torch.zeros_like(yaw_rad)
     return torch.stack([(yaw_rad / 2).cos(), nothing, nothing, (yaw_rad / 2).sin()], dim=-1)
+
+
+def grasp_height_m(height_m: float) -> float:
+    """How far above its foot the gripper, from above, takes a thing of this height.
+
+    At the middle; but the palm stays off its top, and the fingertips, which reach 9.5 mm below the
+    tool centre, off what it stands on, with room for the 5 mm that the arm may overshoot.
+    """
+    return max(height_m / 2, height_m - 0.025, 0.0165)
+
+
+def roomy_yaw(heading_rad: float, others_m: Float64[np.ndarray, "n 2"]) -> float:
+    """Gripper yaw that closes on a four-sided thing with the palm far from the others.
+
+    `others_m` are the others' centres as seen from this one, in the world frame. Of the two ways,
+    the one in which the palm, which is wider than the fingers, comes less close to them.
+    """
+
+    def gap_m(yaw_rad: float) -> float:
+        along = np.array([[-np.sin(yaw_rad), np.cos(yaw_rad)], [np.cos(yaw_rad), np.sin(yaw_rad)]])
+        beyond = np.maximum(np.abs(others_m @ along.T) - _PALM_REACH_M, 0)
+        return float(np.linalg.norm(beyond, axis=1).min())
+
+    yaws = (heading_rad, heading_rad - np.copysign(np.pi / 2, heading_rad))
+    return max(yaws, key=gap_m)
 
 
 def downwards(

@@ -86,11 +86,6 @@ def cup_height_m(diameter_m: Length) -> Length:
     return 1.3 * diameter_m
 
 
-def cup_grasp_m(height_m: float) -> float:
-    """Height above its lower end at which the gripper closes on a cup, from above."""
-    return max(height_m - 0.025, height_m / 2)
-
-
 def cup_grasp_yaw(heading_rad: float) -> float:
     """Gripper yaw that closes across the handle, on two flat facets of the wall.
 

@@ -4,26 +4,21 @@ A task adds the candidates' shape, where they rest, what counts as handled, the 
 and the expert's keyframes. World frame: table top at z = 0, robot base at x = -0.615.
 """
 
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Link, Pose
-from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, props, scenes, sizes, wording
+from sacil_tasks import cameras, instructions, props, scenes, simulation, sizes, wording
 from sacil_tasks.contacts import ContactLog
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
@@ -77,7 +72,7 @@ class SizedTableEnv(BaseEnv):
         self._split = "canon"
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
-        _spare_imports_from_collection()
+        simulation.spare_imports_from_collection()
         super().__init__(
             *args,
             robot_uids=robot_uids,
@@ -149,6 +144,17 @@ class SizedTableEnv(BaseEnv):
         asked = zip(self.task.blanks.items(), self._asked[i].tolist(), strict=True)
         return {name: words[word] for (name, words), word in asked}
 
+    def ask(self, slots: Slots) -> None:
+        """Change what the instruction means, and nothing else.
+
+        Raises:
+            UsageError: the slots do not belong to the task.
+        """
+        instructions.check_slots(self.task, slots, self._split)
+        words = [known.index(slots[name]) for name, known in self.task.blanks.items()]
+        self._asked[:] = torch.tensor(words, device=self.device)
+        self._find_targets()
+
     def target_order(self, i: int = 0) -> tuple[int, ...]:
         """Indices of the named candidates of environment `i`, in the order named."""
         return tuple(self._targets[i].tolist())
@@ -215,12 +221,7 @@ class SizedTableEnv(BaseEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        return SimConfig(
-            sim_freq=100,
-            control_freq=20,
-            scene_config=SceneConfig(solver_position_iterations=20, contact_offset=0.01),
-            default_materials_config=DefaultMaterialsConfig(0.5, 0.5, 0.0),
-        )
+        return simulation.sim_config()
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -228,8 +229,7 @@ class SizedTableEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at((0.55, 0.55, 0.55), (-0.1, 0.0, 0.1))
-        return CameraConfig("render_camera", pose, 512, 512, 0.9, 0.01, 100, shader_pack="default")
+        return simulation.spectator()
 
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -273,7 +273,7 @@ class SizedTableEnv(BaseEnv):
         ]
         self._load_extras()
         self._variant.build(self.scene)
-        self._create_state()
+        self._create_state(self._variant.labels, sizes_m)
 
     def _build_batch(
         self, k: int, sizes_m: Float64[np.ndarray, "b"], rgbs: list[Float64[np.ndarray, "3"]]
@@ -285,10 +285,12 @@ class SizedTableEnv(BaseEnv):
 
         return props.build_each(self.scene, f"candidate_{k}", build)
 
-    def _create_state(self) -> None:
+    def _create_state(
+        self, labels: Int64[np.ndarray, "b 3"], sizes_m: Float64[np.ndarray, "b 3"]
+    ) -> None:
         """Allocate what belongs to the task and is not physics."""
-        self._labels = torch.as_tensor(self._variant.labels, device=self.device)
-        self._sizes_m = self._to_tensor(list(self._variant.sizes_m))
+        self._labels = torch.as_tensor(labels, device=self.device)
+        self._sizes_m = torch.as_tensor(sizes_m, device=self.device, dtype=torch.float32)
         self._yaw_rad = torch.zeros_like(self._sizes_m)
         self._asked = torch.zeros(
             (self.num_envs, len(self.task.blanks)), dtype=torch.int64, device=self.device
@@ -299,10 +301,7 @@ class SizedTableEnv(BaseEnv):
         self.contacts = ContactLog(self.scene, self.agent, self._touchable())
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
-        """Fixed, shadowless light: part of the benchmark's definition."""
-        self.scene.set_ambient_light([0.35, 0.35, 0.35])
-        self.scene.add_directional_light([-0.5, -0.35, -1.0], [0.9, 0.9, 0.9])
-        self.scene.add_directional_light([0.7, 0.6, -1.0], [0.5, 0.5, 0.5])
+        simulation.add_light(self.scene)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
         self.agent.reset(np.tile(HOME_QPOS, (len(env_idx), 1)))
@@ -340,7 +339,9 @@ class SizedTableEnv(BaseEnv):
 
     def _after_control_step(self) -> None:
         self._update_events()
-        self.contacts.look(self._handles())
+
+    def _after_simulation_step(self) -> None:
+        self.contacts.look(self._handles)
 
     def _touch_and_carry(self) -> None:
         forces_n = self._sensor.forces_n()
@@ -397,16 +398,6 @@ class SizedTableEnv(BaseEnv):
 
     # Helpers -------------------------------------------------------------------------------------
 
-    @contextmanager
-    def _writing_state(self) -> Iterator[None]:
-        """Between two control steps: on the GPU, poses and targets are written in bulk."""
-        if self.gpu_sim_enabled:
-            self.scene._gpu_fetch_all()  # noqa: SLF001 -- as ManiSkill's own tasks do
-        yield
-        if self.gpu_sim_enabled:
-            self.scene._gpu_apply_all()  # noqa: SLF001
-            self.scene._gpu_fetch_all()  # noqa: SLF001
-
     def _to_tensor(self, rows: list[np.ndarray]) -> Float[Tensor, "n ..."]:
         """Stack rows drawn by numpy."""
         return torch.as_tensor(np.stack(rows), dtype=torch.float32, device=self.device)
@@ -436,14 +427,3 @@ class SizedTableEnv(BaseEnv):
 def _in_order(order: Int[Tensor, "3"]) -> tuple[int, ...]:
     happened = [(rank, k) for k, rank in enumerate(order.tolist()) if rank > 0]
     return tuple(k for _, k in sorted(happened))
-
-
-@cache
-def _spare_imports_from_collection() -> None:
-    """Keep libraries out of garbage collection, once per process.
-
-    ManiSkill collects garbage at each rebuild, and walking through the modules of torch would take
-    most of a reset.
-    """
-    gc.collect()
-    gc.freeze()

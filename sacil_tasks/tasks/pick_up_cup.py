@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
-from sacil_tasks.poses import downwards
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
 
@@ -79,7 +79,7 @@ class PickUpCupEnv(SizedTableEnv):
         height_m = props.cup_height_m(self.sizes_m[choice[0]])
         at, heading = self._start_pose(choice[0])
         yaw = props.cup_grasp_yaw(heading)
-        grasp = np.array([at[0], at[1], props.cup_grasp_m(height_m)])
+        grasp = np.array([at[0], at[1], grasp_height_m(height_m)])
         above = np.array([at[0], at[1], height_m + 0.08])
         lift = grasp + np.array([0, 0, 0.20])
         return [

@@ -11,7 +11,7 @@ from torch import Tensor
 from sacil_tasks import fixtures, props
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.placing import PlacingEnv, seen_from
-from sacil_tasks.poses import downwards
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.spec import Fixture, TaskSpec
 
 SPEC = TaskSpec(
@@ -101,7 +101,7 @@ class PlaceCupEnv(PlacingEnv):
             height_m = props.cup_height_m(self.sizes_m[k])
             at, heading = self._start_pose(k)
             yaw = props.cup_grasp_yaw(heading)
-            grasp_m = props.cup_grasp_m(height_m)
+            grasp_m = grasp_height_m(height_m)
             peg = self._on_fixture(np.array([peg_m, 0.0, fixtures.PLATE_TOP_M]))
             above, high = np.array([*at[:2], height_m + 0.08]), np.array([*at[:2], CARRY_M])
             over = np.array([*peg[:2], CARRY_M])

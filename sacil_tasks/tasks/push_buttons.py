@@ -12,6 +12,7 @@ from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.poses import downwards
 from sacil_tasks.scenes import Layout
+from sacil_tasks.simulation import writing_state
 from sacil_tasks.sizes import CANDIDATES
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
@@ -80,7 +81,7 @@ class PushButtonsEnv(SizedTableEnv):
         self._touch_and_carry()
         travel_m = torch.cat([button.qpos for button in self.candidates], dim=-1)
         if self.events.handle(travel_m < PRESSED_M).any():
-            with self._writing_state():
+            with writing_state(self.scene):
                 self._show_pressed(torch.arange(self.num_envs, device=self.device))
 
     def _show_pressed(self, env_idx: Tensor) -> None:
@@ -100,7 +101,7 @@ class PushButtonsEnv(SizedTableEnv):
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         """Restore presses too: drive targets are not part of ManiSkill's state."""
         super().set_state_dict(state, env_idx)
-        with self._writing_state():
+        with writing_state(self.scene):
             self._show_pressed(torch.arange(self.num_envs, device=self.device))
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:

@@ -3,14 +3,14 @@
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
 from sacil_tasks import fixtures, props
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.placing import PlacingEnv, seen_from
-from sacil_tasks.poses import downwards
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.spec import Fixture, TaskSpec
 
 SPEC = TaskSpec(
@@ -42,9 +42,6 @@ SPEC = TaskSpec(
 
 DROP_XY_M = ((-0.06, 0.14), (-0.06, 0.27))
 """Where the expert sets down the first and the second pepper."""
-
-_PALM_REACH_M = (0.102, 0.0315)
-"""Half extents of the palm along and across the closing axis."""
 
 
 class TakeOffPepperEnv(PlacingEnv):
@@ -91,9 +88,8 @@ class TakeOffPepperEnv(PlacingEnv):
         keyframes = []
         for k, spot_m in zip(choice, DROP_XY_M, strict=False):
             (x, y, _), _ = self._start_pose(k)
-            yaw, height_m = self._grasp_yaw(k), props.pepper_height_m(self.sizes_m[k])
-            # At the middle, or as high as keeps the palm off its top.
-            grasp_m = max(height_m / 2, height_m - 0.025)
+            yaw, height_m = self._roomy_yaw(k), props.pepper_height_m(self.sizes_m[k])
+            grasp_m = grasp_height_m(height_m)
             high, low = np.array([x, y, 0.30]), np.array([x, y, fixtures.PAN_TOP_M + grasp_m])
             # Closing along x, so that the palm stays clear of a pepper set down before.
             over, down = np.array([*spot_m, 0.25]), np.array([*spot_m, grasp_m + 0.006])
@@ -106,20 +102,3 @@ class TakeOffPepperEnv(PlacingEnv):
                 downwards(over, np.pi / 2, gripper_open=True, ignore_collisions=True),
             ]
         return keyframes
-
-    def _grasp_yaw(self, k: int) -> float:
-        """Across two lobes: of the two ways, the one that keeps the palm away from the others."""
-        at, heading = self._start_pose(k)
-        others = np.array(
-            [self._start_pose(i)[0] - at for i in range(len(self.candidates)) if i != k]
-        )
-        yaws = [heading, heading - np.sign(heading) * np.pi / 2]
-        return max(yaws, key=lambda yaw: _palm_gap_m(others[:, :2], yaw))
-
-
-def _palm_gap_m(others_m: Float64[np.ndarray, "n 2"], yaw_rad: float) -> float:
-    """Distance from the palm to the nearest other pepper's axis, seen from above."""
-    closing = np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
-    across = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
-    offset_m = np.abs(np.stack([others_m @ closing, others_m @ across], axis=1)) - _PALM_REACH_M
-    return float(np.linalg.norm(np.maximum(offset_m, 0), axis=1).min())
