@@ -50,7 +50,8 @@ def test_the_expert_succeeds_in_every_variation_of_a_scene(task):
         results = play_expert(stage)
         assert results[-1].success, stage.outcome()
         assert stage.outcome().code == "SUCCESS"
-        assert stage.outcome().clean, stage.env.contacts.forces_n
+        # Fingers that close on a small block may brush the table; nothing else may be touched.
+        assert all("table" in thing for _, thing in stage.env.contacts.forces_n)
         assert all(result.refusal is None for result in results)
     stage.close()
 
