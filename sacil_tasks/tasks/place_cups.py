@@ -21,6 +21,7 @@ SPEC = TaskSpec(
     yaw_limit_deg=180.0,
     region_m=((-0.22, 0.05), (0.0, 0.28)),
     fixture=Fixture(xy_m=(-0.06, -0.20), shift_m=0.03, yaw_deg=((-20.0, 20.0),)),
+    clutter_region_m=((-0.24, 0.09), (0.0, 0.31)),
 )
 
 

@@ -42,6 +42,7 @@ SPEC = TaskSpec(
         spots_m=((-0.09, -0.085), (-0.09, 0.085), (-0.21, 0.0)),
         spot_shift_m=0.012,
     ),
+    clutter_region_m=((0.11, 0.14), (0.02, 0.14)),
 )
 
 OPENED_M = 0.05
