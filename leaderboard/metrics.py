@@ -142,7 +142,8 @@ def sensitive_scenes(records: Iterable[EpisodeRecord]) -> Tally:
 
 
 def understood_scenes(records: Iterable[EpisodeRecord]) -> Tally:
-    """Scenes in which every first choice was right, whatever the words: by chance 1 in 27."""
+    """Scenes in which every first choice was right, whatever the words: by chance 1 in 27 where
+    there are three."""
     return Tally.of(
         all(record.handled[:1] == record.asked[:1] != () for record in scene)
         for scene in _scenes(records)

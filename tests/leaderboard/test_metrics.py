@@ -8,6 +8,7 @@ import pytest
 from made_up import make_records
 
 from leaderboard import metrics
+from leaderboard.plan import words_per_scene
 from leaderboard.records import EpisodeRecord
 from leaderboard.stats import Tally
 from leaderboard.summary import cells, row
@@ -107,8 +108,9 @@ def test_the_absolute_bias_tells_trained_sizes_from_ranks(task):
 def test_random_choices_look_sensitive_but_understand_nothing(task):
     rng = np.random.default_rng(0)
     records = played(task, lambda _: rng.permutation(LABELS)[:1].tolist(), episodes=900)
-    assert metrics.sensitive_scenes(records).rate == pytest.approx(8 / 9, abs=0.06)
-    assert metrics.understood_scenes(records).rate == pytest.approx(1 / 27, abs=0.04)
+    words = words_per_scene(task, "canon")
+    assert metrics.sensitive_scenes(records).rate == pytest.approx(1 - 3 ** (1 - words), abs=0.06)
+    assert metrics.understood_scenes(records).rate == pytest.approx(3**-words, abs=0.04)
     assert metrics.Bias.of(records).share == pytest.approx(0, abs=0.1)
 
 

@@ -36,7 +36,9 @@ def test_a_wrong_word_is_one_sentence_before_anything_starts(changes, sentence, 
 def test_under_a_suite_a_split_that_a_task_lacks_is_not_applicable(tmp_path):
     config = RunConfig(agent="oracle", suite="single", split=("shift_up",), out=tmp_path)
     job = Job.of(config)
-    assert {key.task for key in job.keys} == {"pick_and_lift"}
+    tasks = {key.task for key in job.keys}
+    assert "pick_and_lift" in tasks
+    assert "pick_up_cup" not in tasks
     assert any(line.startswith("n/a  pick_up_cup shift_up: its larg") for line in job.not_there)
 
 

@@ -169,9 +169,10 @@ def test_a_cut_line_is_dropped_other_code_not_counted_and_foreign_files_refused(
 
 
 @pytest.mark.sim
+@pytest.mark.slow
 def test_a_small_audit_holds_and_its_trials_are_kept(tmp_path, capsys) -> None:
     config = AuditConfig(
-        tasks=("push_buttons",), resets=60, looks=1, scripts=2, scenes=1, workers=1, out=tmp_path
+        tasks=("push_buttons",), resets=20, looks=1, scripts=1, scenes=1, workers=1, out=tmp_path
     )
     audit.main(config)
     first = capsys.readouterr().out
