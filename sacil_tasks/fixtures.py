@@ -61,7 +61,10 @@ _DRAWER_BOXES_M = (
 
 
 def build_scale(scene: ManiSkillScene, name: str) -> Actor:
-    """Weighing scale, origin under its middle: a body with a flat pan on top; nothing moves."""
+    """Weighing scale, origin under its middle: a body with a flat pan on top; nothing moves.
+
+    D-scale.
+    """
     builder = scene.create_actor_builder()
     body_m, pan_m = PAN_TOP_M - _PAN_THICKNESS_M, _PAN_THICKNESS_M / 2
     _add_box(scene, builder, (0.0, 0.0, body_m / 2), (0.10, 0.10, body_m / 2), _DARK)

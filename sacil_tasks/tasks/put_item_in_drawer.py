@@ -66,7 +66,7 @@ class PutItemInDrawerEnv(PlacingEnv):
     """
     **Task Description:**
     Three cubes that differ in size only lie on a cabinet with three drawers. Open the drawer that
-    is named and put the cube whose size is named into it.
+    is named and put the cube whose size is named into it. D-cabinet.
 
     With `reset(options={"drawer_open": True})` the named drawer is open from the start; the
     expert's first four keyframes are then of no use.
