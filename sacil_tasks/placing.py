@@ -39,6 +39,12 @@ class PlacingEnv(SizedTableEnv):
         """Whether a candidate that lies in a place (-1: in none) is where a named one should be."""
         return places >= 0
 
+    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
+        extra = super()._get_obs_extra(info)
+        if self.obs_mode_struct.use_state:
+            extra["fixture_pose"] = self.fixture.pose.raw_pose
+        return extra
+
     def _roomy_yaw(self, k: int) -> float:
         """Gripper yaw for candidate `k` of environment 0, away from the other two."""
         (here, heading), *others = [

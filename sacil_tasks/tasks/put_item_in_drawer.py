@@ -120,6 +120,12 @@ class PutItemInDrawerEnv(PlacingEnv):
             named = torch.nn.functional.one_hot(self._drawer[env_idx], len(self.drawers))
             self.fixture.set_qpos(OPENING_M * named)
 
+    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
+        extra = super()._get_obs_extra(info)
+        if self.obs_mode_struct.use_state:
+            extra["drawers_out_m"] = self.fixture.qpos
+        return extra
+
     @property
     def _drawer(self) -> Int[Tensor, "b"]:
         """Index of the named drawer."""
