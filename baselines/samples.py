@@ -167,7 +167,10 @@ class KeyframeSet:
 
         Raises:
             UsageError: no task has demos of two sizes.
+            ValueError: `count` is below 2: no draw would ever show two sizes.
         """
+        if count < 2:
+            raise ValueError(f"a draw of {count} cannot show two sizes; at least 2 are needed")
         self._require_two_meanings()
         while True:
             samples = [self._draw_one(rng, choice_share) for _ in range(count)]

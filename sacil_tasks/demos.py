@@ -124,6 +124,11 @@ class DemoJob:
         """The same in every redraw, so that the words stay balanced."""
         return self.index % len(variations(task_spec(self.demos.task)))
 
+    @property
+    def given_up(self) -> bool:
+        """Whether so many scenes were tried in vain that it is not worth another."""
+        return len(self.failures) >= MAX_FAILURES
+
     def scene_index(self, redraw: int) -> int:
         """Scene of a redraw: beyond the scenes of all other demos."""
         return self.index + redraw * REDRAW_STRIDE
