@@ -152,12 +152,12 @@ def _report(folder: Path) -> None:
 
 def _score_line(name: str, scores: dict[str, Any]) -> str:
     total = scores["keyframes"]
-    first, later = (scores[f"selected_{when}"] for when in ("first", "later"))
+    words, hand = (scores[f"selected_by_{what}"] for what in ("words", "hand"))
     return (
         f"{name:<32} position {scores['position_mm']:6.1f} mm  "
         f"rotation {scores['rotation_within_5deg'] / total:4.0%}  "
         f"gripper {scores['gripper_right'] / total:4.0%}  "
-        f"selected {first[0]}/{first[1]} first, {later[0]}/{later[1]} later"
+        f"selected {words[0]}/{words[1]} by words, {hand[0]}/{hand[1]} by hand"
     )
 
 
