@@ -25,7 +25,7 @@ AGENT_PACKAGES = ("baselines.agents", "sacil_agent.agents")
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How a network is trained; shared by all agents so that tables compare methods."""
+    """How a network is trained (D-recipe); shared by all agents so that tables compare methods."""
 
     samples: int = 120_000
     """Behaviour-cloning samples in all: the budget, whatever the machine's speed."""

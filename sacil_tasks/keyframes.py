@@ -231,6 +231,7 @@ def _observation_columns(
         "next_index": np.array(_next_rows(first_row, count)),
         "keyframe_in_base": np.array([*commanded, np.full(7, np.nan)]),
         "keyframe_open": np.array([*(k.gripper_open for k in asked), False]),
+        # D-collision: each keyframe's own label.
         "keyframe_ignore_collisions": np.array([*(k.ignore_collisions for k in asked), False]),
         "target_index": np.array([*demo.targets, NO_ROW]),
         "candidate_in_base": demo.candidate_in_base,
