@@ -121,14 +121,22 @@ class KeyframeSet:
         """Read `<folder>/<task>.h5` of every task.
 
         Raises:
-            UsageError: a file is missing (says how to make it), truncated or foreign.
+            UsageError: a file is missing (says how to make it), truncated, foreign, or of another
+                task than its name says.
         """
         missing = [task for task in tasks if not (folder / f"{task}.h5").is_file()]
         if missing:
             raise UsageError(
                 f"no keyframes of {', '.join(missing)} in {folder}. " + _gen_demos(*missing)
             )
-        return cls([Shard.load(folder / f"{task}.h5") for task in tasks])
+        shards = [Shard.load(folder / f"{task}.h5") for task in tasks]
+        for task, shard in zip(tasks, shards, strict=True):
+            if shard.task != task:
+                raise UsageError(
+                    f"{shard.path} holds keyframes of {shard.task}, not of {task}. Move it away. "
+                    + _gen_demos(task)
+                )
+        return cls(shards)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -163,9 +171,9 @@ class KeyframeSet:
     ) -> list[Sample]:
         """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
 
-        With `choice_share`, that share of them shows keyframes at which the words decide, and tasks
-        weigh there by how many of these a demo has: other keyframes can be told from where the hand
-        is, so they do not teach what the words mean.
+        With `choice_share`, that share of them shows keyframes at which the words decide
+        (D-choice-share), and tasks weigh there by how many of these a demo has: other keyframes
+        can be told from where the hand is, so they do not teach what the words mean.
 
         A draw without two sizes of one task is repeated: such a batch would let a contrast be
         solved by task identity (D-two-sizes). RVT draws keyframes uniformly within a task and

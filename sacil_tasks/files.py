@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import h5py
 
 from sacil_tasks.errors import UsageError
 
@@ -30,6 +32,23 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # the folder itself may be what is wrong
             draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_hdf5(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.File]:
+    """Yield an HDF5 file in memory, new or as it is on disk; written only if the block succeeds.
+
+    A disk that fills up under an open file would crash HDF5, and the process with it.
+
+    Raises:
+        UsageError: the folder cannot be written or the disk is full.
+    """
+    with atomic_path(path) as draft:
+        with h5py.File(path, mode, driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        draft.write_bytes(image)
 
 
 def unwritable(path: Path, error: OSError) -> UsageError:

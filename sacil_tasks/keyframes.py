@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path
+from sacil_tasks.files import atomic_hdf5
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, Keyframe, Observation
 
 KIND = "sacil-keyframes"
@@ -112,7 +112,7 @@ def write_keyframes(path: Path, demos: Sequence[KeyframeDemo], meta: KeyframeMet
     Raises:
         UsageError: the folder cannot be written or the disk is full.
     """
-    with atomic_path(path) as draft, h5py.File(draft, "w") as file:
+    with atomic_hdf5(path) as file:
         create_tables(file, rows=sum(len(d.observations) for d in demos), episodes=len(demos))
         first_row = 0
         for episode_id, demo in enumerate(demos):

@@ -189,6 +189,18 @@ def test_a_missing_file_names_the_command_that_makes_it(tmp_path):
         KeyframeSet.load(tmp_path, ["pick_and_lift"])
 
 
+def test_a_file_of_another_task_is_refused(tmp_path):
+    path = synthetic.write_file(tmp_path, "pick_up_cup", demos=2)
+    path.rename(path.with_name("pick_and_lift.h5"))
+    with pytest.raises(UsageError, match="keyframes of pick_up_cup, not of pick_and_lift"):
+        KeyframeSet.load(path.parent, ["pick_and_lift"])
+
+
+def test_a_draw_too_small_for_two_sizes_is_refused_instead_of_repeated_forever(keyframes):
+    with pytest.raises(ValueError, match="at least 2"):
+        keyframes.draw(stream(0, 0, "rows"), 1, None)
+
+
 def test_demos_of_one_size_cannot_teach_size(tmp_path):
     synthetic.write_file(tmp_path, "pick_and_lift", demos=1)
     keyframes = KeyframeSet.load(tmp_path / "canon/train/keyframes", ["pick_and_lift"])
