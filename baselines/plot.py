@@ -1,6 +1,5 @@
 """Draw the curves of training runs beside each other: `python -m baselines.plot RUN [RUN ...]`."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from baselines.checkpoint import METRICS
+from baselines.run import read_rows
 from sacil_tasks.errors import UsageError, run_command
 from sacil_tasks.files import atomic_path
 
@@ -65,25 +65,18 @@ def main(config: PlotConfig) -> None:
 
 
 def read_metrics(folder: Path) -> list[Row]:
-    """The rows of a run's metrics that carry a time, oldest first.
+    """The rows of a run's metrics with their time as `core_min`, oldest first.
 
     Raises:
         UsageError: there are none.
     """
-    try:
-        lines = (folder / METRICS).read_text().splitlines()
-        return _timed([json.loads(line) for line in lines])
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"no training run in {folder}: expected {METRICS} in it ({error}). "
-            "Name the --out folders of `python -m baselines.train`."
-        ) from error
-
-
-def _timed(rows: Sequence[Row]) -> list[Row]:
-    """Rows with `core_min`; a validation has the time of the training row of its step."""
+    rows = read_rows(folder / METRICS)
     if not rows:
-        raise ValueError("it is empty")
+        raise UsageError(
+            f"no training run in {folder}: expected {METRICS} with at least one line in it. "
+            "Name the --out folders of `python -m baselines.train`."
+        )
+    # A validation has the time of the training row of its step.
     minutes = {row["step"]: row["cpu_s"] / 60 for row in rows if row["kind"] == "train"}
     return [{**row, "core_min": minutes[row["step"]]} for row in rows if row["step"] in minutes]
 
