@@ -25,15 +25,15 @@ AGENT_PACKAGES = ("baselines.agents", "sacil_agent.agents")
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How a network is trained; shared by all agents so that tables compare methods."""
+    """How a network is trained (D-recipe); shared by all agents so that tables compare methods."""
 
-    samples: int = 112_000
+    samples: int = 120_000
     """Behaviour-cloning samples in all: the budget, whatever the machine's speed."""
 
     batch: int = 16
     """Samples of one step."""
 
-    choice_share: float | None = 0.5
+    choice_share: float | None = 0.6
     """Share of samples that show a keyframe at which the words decide where to go: the first one
     of each candidate to be handled (D-choice-share); None draws all keyframes alike."""
 

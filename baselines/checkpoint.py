@@ -109,8 +109,8 @@ def load(folder: Path, *, agent: str, tasks: Sequence[str] = ()) -> Checkpoint:
     text = SentenceTable.load(folder / TEXT)
     if text.spec != identity.text:
         raise UsageError(
-            f"{folder / TEXT} was made by the text encoder {text.spec.name}, but the network was "
-            f"trained on {identity.text.name}. Copy the checkpoint again."
+            f"{folder / TEXT} was made by the text encoder {text.spec.short}, but the network was "
+            f"trained on {identity.text.short}. Copy the checkpoint again."
         )
     with _readable(folder / MODEL):
         weights = load_file(folder / MODEL)

@@ -48,7 +48,7 @@ def read_at(
 
 
 class ActionHead(nn.Module):
-    """Rotation, gripper and collision from tokens and feature maps."""
+    """Rotation, gripper and collision from tokens and feature maps (D-head)."""
 
     def __init__(
         self, token_channels: int, map_channels: Sequence[int], hidden: tuple[int, int]
@@ -101,7 +101,7 @@ def _heatmap_loss(logits: Float[Tensor, "b v h w"], target: Float[Tensor, "b v h
 
 
 def _rotation_loss(logits: Float[Tensor, "b 3 bins"], labels: Labels, sigma_bins: float) -> Tensor:
-    """Sum over the three angles of the cross-entropy with circular labels."""
+    """Sum over the three angles of the cross-entropy with circular labels (D-rotation)."""
     if sigma_bins > 0:
         target = soft_labels(labels.rotation_bins, sigma_bins)
     else:

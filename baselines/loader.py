@@ -53,7 +53,8 @@ class Loader:
     def batch(self, step: int) -> Batch:
         """The training batch of `step`: a pure function of the seed and `step`.
 
-        Goals have their own random stream, so they never change what behaviour cloning sees.
+        Goals have their own random stream (D-goal), so they never change what behaviour cloning
+        sees.
         """
         rng = stream(self._seed, step, "rows")
         samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.choice_share)

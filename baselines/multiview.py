@@ -29,7 +29,7 @@ from sacil_tasks.errors import UsageError
 
 @dataclass(frozen=True, kw_only=True)
 class MultiViewConfig:
-    """Sizes of a view-based network; the defaults are the `cpu` preset."""
+    """Sizes of a view-based network; the defaults are the `cpu` preset (D-cpu)."""
 
     pixels: int = 96
     """Pixels per side of a virtual view."""

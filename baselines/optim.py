@@ -61,7 +61,7 @@ def learning_rate(step: int, *, total: int, peak: float, warmup: int) -> float:
     """Learning rate of `step` (from 0): linear warm-up, then a cosine towards a hundredth.
 
     As in RVT the cosine's period is the whole run, so the last step stays a little above the
-    floor. A run too short for `warmup` spends a tenth of its steps on it.
+    floor. A run too short for `warmup` spends a tenth of its steps on it (D-recipe).
     """
     warmup = min(warmup, max(1, total // 10))
     if step < warmup:
@@ -72,7 +72,7 @@ def learning_rate(step: int, *, total: int, peak: float, warmup: int) -> float:
 
 
 class Ema:
-    """Exponential average of a network's weights; the average is what is saved and evaluated."""
+    """Exponential average of a network's weights (D-average): what is saved and evaluated."""
 
     def __init__(self, network: nn.Module, *, decay: float) -> None:
         """Start at the weights `network` has now."""

@@ -30,6 +30,7 @@ class KeyframePolicy:
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         """Act with the network of `checkpoint`, on its device, in evaluation mode."""
+        self.checkpoint_sha256 = checkpoint.sha256
         self._network = checkpoint.network.eval()
         self._text = checkpoint.text
         self._pixels: int = checkpoint.identity.config.pixels

@@ -10,7 +10,8 @@ from pathlib import Path
 import tyro
 
 from baselines.checkpoint import Identity, export_release, released_folder
-from sacil_tasks.errors import run_command
+from sacil_tasks.catalog import suite_tasks
+from sacil_tasks.errors import UsageError, run_command
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +29,17 @@ def main(config: ReleaseConfig) -> None:
     """Export the checkpoint.
 
     Raises:
-        UsageError: the run is not finished or not readable.
+        UsageError: the suite is unknown or not what the run was trained on, or the run is not
+            finished or not readable.
     """
-    target = released_folder(Identity.load(config.run).agent) / config.suite
+    tasks = suite_tasks(config.suite)
+    identity = Identity.load(config.run)
+    if set(identity.tasks) != set(tasks):
+        raise UsageError(
+            f"{config.run} was trained on {', '.join(identity.tasks)}, but the suite "
+            f"{config.suite} is {', '.join(tasks)}. Choose the run's suite with --suite."
+        )
+    target = released_folder(identity.agent) / config.suite
     export_release(config.run, target)
     print(f"released {config.run} as {target}")
 

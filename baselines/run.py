@@ -1,6 +1,5 @@
 """A training run in its folder: steps, log, validation, saves, a clean stop."""
 
-import importlib.metadata
 import json
 import logging
 import math
@@ -21,7 +20,7 @@ from baselines.agent import Network
 from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
 from baselines.trainer import Trainer
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path, write_json
+from sacil_tasks.files import atomic_path, code_version, unwritable, write_json
 
 log = logging.getLogger(__name__)
 
@@ -134,12 +133,7 @@ class Run:
                         self.save()
                         saved = time.monotonic()
         if stopped and not done:
-            log.info(
-                "saved step %d of %d in %s: the same command with --resume goes on",
-                trainer.step,
-                trainer.steps,
-                self.folder,
-            )
+            log.info("saved step %d of %d in %s", trainer.step, trainer.steps, self.folder)
             raise KeyboardInterrupt
 
     def _advance(self) -> None:
@@ -161,7 +155,7 @@ class Run:
             "wall_minutes": round(self.wall_s / 60, 2),
             "core_minutes": round(self.cpu_s / 60, 2),
             "keyframes_sha256": self.plan["keyframes"],
-            "code_version": _code_version(),
+            "code_version": code_version(),
             "torch": torch.__version__,
         }
 
@@ -188,17 +182,17 @@ class Run:
         append_row(self.folder / METRICS, row)
 
 
-def _code_version() -> str:
-    try:
-        return importlib.metadata.version("sacil")
-    except importlib.metadata.PackageNotFoundError:  # a checkout that is not installed
-        return "unknown"
-
-
 def append_row(path: Path, row: Row) -> None:
-    """Append one line of JSON."""
-    with path.open("a") as file:
-        file.write(json.dumps(row) + "\n")
+    """Append one line of JSON.
+
+    Raises:
+        UsageError: the disk is full or gone.
+    """
+    try:
+        with path.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def read_rows(path: Path) -> list[Row]:

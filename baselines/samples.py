@@ -5,14 +5,14 @@ What is drawn is a pure function of (seed, step), so a resumed run sees what an 
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
@@ -84,6 +84,11 @@ class Shard:
         turns = [row for row in rows[1:] if NO_ROW != targets[row] != targets[row - 1]]
         return [*rows[:1], *turns]
 
+    def others(self, episode: int) -> Sequence[int]:
+        """Rows that can be told from where the hand is; all rows where there are none."""
+        choices, rows = self.choices(episode), self.keyframes(episode)
+        return [row for row in rows if row not in choices] or rows
+
     def observation(self, row: int) -> Observation:
         """The observation of `row`, as a policy would have seen it; nothing is copied."""
         c = self.columns
@@ -116,14 +121,22 @@ class KeyframeSet:
         """Read `<folder>/<task>.h5` of every task.
 
         Raises:
-            UsageError: a file is missing (says how to make it), truncated or foreign.
+            UsageError: a file is missing (says how to make it), truncated, foreign, or of another
+                task than its name says.
         """
         missing = [task for task in tasks if not (folder / f"{task}.h5").is_file()]
         if missing:
             raise UsageError(
                 f"no keyframes of {', '.join(missing)} in {folder}. " + _gen_demos(*missing)
             )
-        return cls([Shard.load(folder / f"{task}.h5") for task in tasks])
+        shards = [Shard.load(folder / f"{task}.h5") for task in tasks]
+        for task, shard in zip(tasks, shards, strict=True):
+            if shard.task != task:
+                raise UsageError(
+                    f"{shard.path} holds keyframes of {shard.task}, not of {task}. Move it away. "
+                    + _gen_demos(task)
+                )
+        return cls(shards)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -158,7 +171,8 @@ class KeyframeSet:
     ) -> list[Sample]:
         """`count` samples: a task, one of its demos, one of the demo's keyframes, each uniform.
 
-        With `choice_share`, that share of them shows a keyframe at which the words decide: others
+        With `choice_share`, that share of them shows keyframes at which the words decide
+        (D-choice-share), and tasks weigh there by how many of these a demo has: other keyframes
         can be told from where the hand is, so they do not teach what the words mean.
 
         A draw without two sizes of one task is repeated: such a batch would let a contrast be
@@ -167,7 +181,10 @@ class KeyframeSet:
 
         Raises:
             UsageError: no task has demos of two sizes.
+            ValueError: `count` is below 2: no draw would ever show two sizes.
         """
+        if count < 2:
+            raise ValueError(f"a draw of {count} cannot show two sizes; at least 2 are needed")
         self._require_two_meanings()
         while True:
             samples = [self._draw_one(rng, choice_share) for _ in range(count)]
@@ -175,15 +192,28 @@ class KeyframeSet:
                 return samples
 
     def _draw_one(self, rng: np.random.Generator, choice_share: float | None) -> Sample:
-        number = int(rng.integers(len(self.shards)))
+        if choice_share is None:
+            return self._draw_from(rng, Shard.keyframes)
+        if rng.random() < choice_share:
+            return self._draw_from(rng, Shard.choices, self._choices_per_demo)
+        return self._draw_from(rng, Shard.others)
+
+    def _draw_from(
+        self,
+        rng: np.random.Generator,
+        rows_of: Callable[[Shard, int], Sequence[int]],
+        task_weights: Float64[np.ndarray, "tasks"] | None = None,
+    ) -> Sample:
+        number = int(rng.choice(len(self.shards), p=task_weights))
         shard = self.shards[number]
-        episode = int(rng.integers(len(shard)))
-        rows: Sequence[int] = shard.keyframes(episode)
-        if choice_share is not None:
-            choices = shard.choices(episode)
-            others = [row for row in rows if row not in choices]
-            rows = choices if rng.random() < choice_share else others or choices
+        rows = rows_of(shard, int(rng.integers(len(shard))))
         return Sample(number, rows[int(rng.integers(len(rows)))])
+
+    @cached_property
+    def _choices_per_demo(self) -> Float64[np.ndarray, "tasks"]:
+        """Mean number of choices in a demo of each task, as shares of one."""
+        counts = [np.mean([len(s.choices(e)) for e in range(len(s))]) for s in self.shards]
+        return np.array(counts) / sum(counts)
 
     def _tells_sizes_apart(self, samples: Sequence[Sample]) -> bool:
         meanings = {self.meaning(sample) for sample in samples}

@@ -27,7 +27,8 @@ Padding: TypeAlias = Literal["zeros", "replicate"]
 
 
 def with_locations(views: Float[Tensor, "b v 7 h w"]) -> Float[Tensor, "b v 10 h w"]:
-    """Append view, row and column of each pixel, each from -1 to 1 (RVT's constant channels)."""
+    """Append view, row and column of each pixel, each from -1 to 1: RVT's constant channels
+    (D-channels)."""
     b, v, _, h, w = views.shape
     axes = [torch.linspace(-1, 1, steps, device=views.device) for steps in (len(VIEWS), h, w)]
     places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=1).to(views.dtype)

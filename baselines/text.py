@@ -1,4 +1,4 @@
-"""Instructions -> token vectors of a frozen text encoder, computed once a sentence.
+"""Instructions -> token vectors of a frozen text encoder (D-text), computed once a sentence.
 
 Embeddings are kept ragged (real tokens only) and in half precision: beside the observations in
 every keyframe file, and in `text.safetensors` of every checkpoint. So neither training nor the
@@ -8,7 +8,6 @@ evaluation of known sentences loads an encoder. Padding is masked: D-text-paddin
 import importlib.util
 import json
 import logging
-import shutil
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -24,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path, content_hash, file_sha256
+from sacil_tasks.files import atomic_hdf5, atomic_path, content_hash, file_sha256
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +59,11 @@ class TextSpec:
 
     fingerprint: str
     """SHA-256 of weights, tokenizer and pre-processing."""
+
+    @property
+    def short(self) -> str:
+        """Name and beginning of the fingerprint: equal names may hide other weights."""
+        return f"{self.name} ({self.fingerprint[:12]})"
 
 
 class TextEncoder:
@@ -204,9 +208,8 @@ class SentenceTable:
         encoder = load_encoder(self.spec.name)
         if encoder.spec != self.spec:
             raise UsageError(
-                f"the text encoder {self.spec.name} on this machine is not the one the "
-                f"embeddings were made with (fingerprint {encoder.spec.fingerprint[:12]}, "
-                f"expected {self.spec.fingerprint[:12]}). Install the same weights."
+                f"the text encoder on this machine is {encoder.spec.short}, but the embeddings "
+                f"were made with {self.spec.short}. Install the same weights."
             )
         return encoder
 
@@ -292,16 +295,14 @@ def _read_cache(path: Path, spec: TextSpec) -> Table:
 def _write_cache(path: Path, table: SentenceTable, sentences: Sequence[str]) -> None:
     tokens, offsets = _pack([table[sentence] for sentence in sentences])
     try:
-        with atomic_path(path) as draft:
-            shutil.copyfile(path, draft)
-            with h5py.File(draft, "r+") as file:
-                name = f"text/{table.spec.fingerprint}"
-                if name in file:
-                    del file[name]
-                group = file.create_group(name)
-                group.attrs.update(asdict(table.spec))
-                group["sentences"] = list(sentences)
-                group["tokens"], group["offsets"] = tokens, offsets
+        with atomic_hdf5(path, "r+") as file:
+            name = f"text/{table.spec.fingerprint}"
+            if name in file:
+                del file[name]
+            group = file.create_group(name)
+            group.attrs.update(asdict(table.spec))
+            group["sentences"] = list(sentences)
+            group["tokens"], group["offsets"] = tokens, offsets
     except UsageError as error:
         # Read-only data can still be trained on; the next run encodes again.
         log.warning("embeddings are not kept: %s", error)

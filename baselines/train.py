@@ -20,6 +20,9 @@ from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
 from baselines.run import Run, read_rows
 from sacil_tasks.errors import UsageError, run_command
+from sacil_tasks.files import sole_writer
+
+AFTER_STOP = "The same command with --resume goes on."
 
 CALIBRATION_STEPS = 8
 """Steps that are timed for `--minutes`; the first two, which compile, are left out."""
@@ -40,8 +43,9 @@ def main(job: Job) -> None:
             print(f"nothing to do: {options.folder} is complete ({state.step} steps).")
             return
     material = Material.load(job)
-    run = _begin(material) if state is None else _continue(material, state)
-    run.finish(validate_every=options.validate_every)
+    with sole_writer(options.folder):
+        run = _begin(material) if state is None else _continue(material, state)
+        run.finish(validate_every=options.validate_every)
     _report(options.folder)
 
 
@@ -148,15 +152,15 @@ def _report(folder: Path) -> None:
 
 def _score_line(name: str, scores: dict[str, Any]) -> str:
     total = scores["keyframes"]
-    first, later = (scores[f"selected_{when}"] for when in ("first", "later"))
+    words, hand = (scores[f"selected_by_{what}"] for what in ("words", "hand"))
     return (
         f"{name:<32} position {scores['position_mm']:6.1f} mm  "
         f"rotation {scores['rotation_within_5deg'] / total:4.0%}  "
         f"gripper {scores['gripper_right'] / total:4.0%}  "
-        f"selected {first[0]}/{first[1]} first, {later[0]}/{later[1]} later"
+        f"selected {words[0]}/{words[1]} by words, {hand[0]}/{hand[1]} by hand"
     )
 
 
 if __name__ == "__main__":
     logging.basicConfig(format="%(message)s", level=logging.INFO)
-    run_command(lambda: main(parse(sys.argv[1:])))
+    run_command(lambda: main(parse(sys.argv[1:])), after_stop=AFTER_STOP)

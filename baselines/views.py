@@ -26,7 +26,8 @@ VIEWS = ("top", "front", "back", "left", "right")
 """Names and order of the views."""
 
 CHANNELS = ("x", "y", "z", "red", "green", "blue", "depth")
-"""Position in the cube frame, colour in [0, 1], depth less its mean over the view's points."""
+"""Position in the cube frame, colour in [0, 1], depth less its mean over the view's points;
+pixel locations are not drawn (D-channels)."""
 
 U_AXIS, U_SIGN = (0, 0, 0, 1, 1), (1, -1, 1, 1, -1)
 V_AXIS = (1, 2, 2, 2, 2)

@@ -7,13 +7,12 @@ import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
 
 from leaderboard.records import EPISODES_FILE
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import write_json
+from sacil_tasks.files import package_version, write_json
 
 KIND = "sacil-evaluation"
 SCHEMA_VERSION = 1
@@ -134,7 +133,7 @@ def counted(folder: Path, ours: Manifest) -> Manifest:
 def installed_versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result may depend on; imports none."""
     return {"python": platform.python_version()} | {
-        package: found for package in PACKAGES if (found := _version(package))
+        package: found for package in PACKAGES if (found := package_version(package))
     }
 
 
@@ -151,13 +150,6 @@ def _read_or_none(path: Path) -> Manifest | None:
         return _parse(path)
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
 
 
 def _differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:

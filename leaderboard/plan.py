@@ -1,7 +1,8 @@
 """A number of episodes -> which episodes, and in which order workers get them.
 
 Episode i of a task is scene i // V with words i % V, where V is the task's number of variations.
-The words of one scene stay together, so that its worker plans and accepts the scene once.
+The words of one scene stay together, so that its worker plans and accepts the scene once
+(D-episodes).
 """
 
 from collections.abc import Iterable

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from sacil_tasks.errors import UsageError
+from sacil_tasks.files import unwritable
 
 SCHEMA_VERSION = 1
 EPISODES_FILE = "episodes.jsonl"
@@ -154,7 +155,7 @@ class EpisodeLog:
             folder.mkdir(parents=True, exist_ok=True)
             self._stream = path.open("a+b", buffering=0)
         except OSError as error:
-            raise _unwritable(path, error) from error
+            raise unwritable(path, error) from error
         try:
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -178,7 +179,7 @@ class EpisodeLog:
             while written < len(line):
                 written += self._stream.write(line[written:])
         except OSError as error:
-            raise _unwritable(self.path, error) from error
+            raise unwritable(self.path, error) from error
         self.records.append(record)
 
     def _drop_cut_line(self) -> None:
@@ -224,13 +225,6 @@ def _parse(path: Path, number: int, line: str) -> EpisodeRecord:
             f"{path} line {number} is not an episode record of schema {SCHEMA_VERSION} ({error}). "
             "The file is damaged or foreign: move it away, or choose another folder with --out."
         ) from error
-
-
-def _unwritable(path: Path, error: OSError) -> UsageError:
-    return UsageError(
-        f"cannot write {path}: {error.strerror or error}. "
-        "Free some space or choose another folder with --out."
-    )
 
 
 def reproducible(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, dict[str, Any]]:

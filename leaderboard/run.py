@@ -273,5 +273,6 @@ def _report(job: Job, log: EpisodeLog) -> None:
 
 if __name__ == "__main__":
     run_command(
-        lambda: main(tyro.cli(RunConfig, prog="python -m leaderboard.run", description=__doc__))
+        lambda: main(tyro.cli(RunConfig, prog="python -m leaderboard.run", description=__doc__)),
+        after_stop="The same command again runs the missing episodes.",
     )

@@ -1,8 +1,8 @@
 """The two contrasts of SACIL (paper section 3.5, Eq. 3 and 4) and what they have learnt.
 
 Both pull matched rows of two feature sets together and push the other rows of the batch apart:
-symmetric InfoNCE, minimised (the printed equations lack a minus sign). Rows that mean the same
-are no negatives (D-mask): with a handful of sizes a batch is full of samples that ask for the
+symmetric InfoNCE, minimised (D-equations: the printed ones lack a minus sign). Rows that mean the
+same are no negatives (D-mask): with a handful of sizes a batch is full of samples that ask for the
 same thing in other words, and the paper takes negatives from other trajectories only.
 """
 

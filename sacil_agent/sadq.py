@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from baselines.layers import BlockSizes, CrossBlock
 
 QUERY_STD = 0.02
-"""Spread of the initial queries. They must differ: equal queries get equal gradients for ever."""
+"""Spread of the initial queries (D-queries). They must differ: equal queries get equal gradients
+for ever."""
 
 
 @dataclass(frozen=True)

@@ -19,4 +19,4 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 if __name__ == "__main__":
     logging.basicConfig(format="%(message)s", level=logging.INFO)
-    run_command(lambda: train.main(parse(arguments(sys.argv[1:]))))
+    run_command(lambda: train.main(parse(arguments(sys.argv[1:]))), after_stop=train.AFTER_STOP)

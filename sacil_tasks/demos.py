@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32
 
 from sacil_tasks.catalog import MAX_EPISODE_STEPS, env_id, suite_names, suite_tasks, task_spec
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path, content_hash, write_json
+from sacil_tasks.files import atomic_hdf5, content_hash, write_json
 from sacil_tasks.instructions import variations
 from sacil_tasks.keyframes import (
     KeyframeDemo,
@@ -124,6 +124,11 @@ class DemoJob:
         """The same in every redraw, so that the words stay balanced."""
         return self.index % len(variations(task_spec(self.demos.task), self.demos.split))
 
+    @property
+    def given_up(self) -> bool:
+        """Whether so many scenes were tried in vain that it is not worth another."""
+        return len(self.failures) >= MAX_FAILURES
+
     def scene_index(self, redraw: int) -> int:
         """Scene of a redraw: beyond the scenes of all other demos."""
         return self.index + redraw * REDRAW_STRIDE
@@ -145,7 +150,7 @@ def save_part(
     Raises:
         UsageError: the folder cannot be written or the disk is full.
     """
-    with atomic_path(demos.part(index)) as draft, h5py.File(draft, "w") as file:
+    with atomic_hdf5(demos.part(index)) as file:
         create_tables(file, rows=len(keyframes.observations), episodes=1)
         write_demo(file, keyframes, episode_id=0, first_row=0)
         _write_trajectory(file.create_group("trajectory"), trajectory)
@@ -290,7 +295,7 @@ def _merge_records(demos: DemoSet, count: int, merged: int) -> list[dict[str, An
 
 
 def _merge_trajectories(demos: DemoSet, count: int, merged: int) -> str:
-    with atomic_path(demos.trajectory) as draft, h5py.File(draft, "w") as file:
+    with atomic_hdf5(demos.trajectory) as file:
         for index in range(count):
             old = index < merged
             path = demos.trajectory if old else demos.part(index)
@@ -307,7 +312,7 @@ def _merge_keyframes(demos: DemoSet, count: int, merged: int, *, demos_sha256: s
         suites={suite: suite_tasks(suite) for suite in suite_names()},
         demos_sha256=demos_sha256,
     )
-    with atomic_path(demos.keyframes) as draft, h5py.File(draft, "w") as file:
+    with atomic_hdf5(demos.keyframes) as file:
         create_tables(file, rows=rows, episodes=count)
         first_row = 0
         for index in range(count):

@@ -17,7 +17,6 @@ import numpy as np
 from sacil_tasks.cameras import observe
 from sacil_tasks.catalog import env_id, task_spec
 from sacil_tasks.demos import ENV_KWARGS
-from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import Slots, variations
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Observation
 from sacil_tasks.motion.executor import KeyframeExecutor
@@ -25,6 +24,7 @@ from sacil_tasks.outcomes import Outcome
 from sacil_tasks.recording import StepRecorder
 from sacil_tasks.scenes import ATTEMPTS, scene_seed
 from sacil_tasks.table import SizedTableEnv
+from sacil_tasks.vulkan import explain_render_failure
 from sacil_tasks.wording import draw_meaning
 
 
@@ -181,6 +181,4 @@ def _make(task: str, *, render: bool) -> gym.Env:
         backend = "cpu" if render else "none"
         return gym.make(env_id(task), render_backend=backend, **ENV_KWARGS).unwrapped
     except RuntimeError as error:
-        raise UsageError(
-            f"nothing here can render ({error}). `python -m sacil_tasks.doctor` says what to do."
-        ) from error
+        raise explain_render_failure(error) from error

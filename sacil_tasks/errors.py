@@ -23,14 +23,17 @@ def find_name(name: str, known: Iterable[str], kind: str) -> str:
     raise UsageError(f"no {kind} called '{name}'.{hint} Known: {', '.join(names) or 'none'}.")
 
 
-def run_command(main: Callable[[], None]) -> None:
-    """Run a command line: a `UsageError` is one sentence and exit code 2, Ctrl-C is 130."""
+def run_command(main: Callable[[], None], *, after_stop: str = "") -> None:
+    """Run a command line: a `UsageError` is one sentence and exit code 2, Ctrl-C is 130.
+
+    `after_stop` tells a user who pressed Ctrl-C how to go on, if there is anything to go on with.
+    """
     try:
         main()
     except UsageError as error:
         sys.exit(_say(error, code=2))
     except KeyboardInterrupt:
-        sys.exit(_say("stopped by Ctrl-C; the same command again resumes.", code=130))
+        sys.exit(_say(f"stopped by Ctrl-C. {after_stop}".rstrip(), code=130))
 
 
 def _say(message: object, *, code: int) -> int:

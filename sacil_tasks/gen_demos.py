@@ -9,10 +9,10 @@ a larger `--demos` extends what is there.
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -32,7 +32,7 @@ from sacil_tasks.demos import (
     read_records,
 )
 from sacil_tasks.errors import UsageError, run_command
-from sacil_tasks.files import atomic_path
+from sacil_tasks.files import atomic_path, code_version, sole_writer
 from sacil_tasks.splits import plan_splits
 from sacil_tasks.workers import JobFailure, run_jobs
 
@@ -80,17 +80,11 @@ def main(config: GenConfig) -> None:
         UsageError: a name is unknown, files are in the way, or demos could not be made.
     """
     sets = plan(config)
-    jobs = [job for demos in sets for job in missing_jobs(demos, config.demos)]
-    started = time.perf_counter()
-    lost = generate(jobs, config.workers)
-    incomplete = {job.demos for job in lost}
-    for demos in sets:
-        if demos not in incomplete:
-            finish(demos, config.demos)
-    _report([demos for demos in sets if demos not in incomplete])
-    if jobs:
-        seconds = time.perf_counter() - started
-        print(f"{len(jobs)} demos in {seconds:.0f} s: {len(jobs) / seconds:.2f} demos/s")
+    with ExitStack() as held:
+        for demos in sets:
+            held.enter_context(sole_writer(demos.folder))
+        lost = make(sets, config)
+    _report([demos for demos in sets if demos not in {job.demos for job in lost}])
     if lost:
         raise UsageError(
             f"{len(lost)} demos could not be made in {MAX_FAILURES} scenes each; the first is "
@@ -121,10 +115,36 @@ def plan(config: GenConfig) -> list[DemoSet]:
             split=split,
             partition=config.partition,
             scene_set=config.seed,
-            code_version=_code_version(),
+            code_version=code_version(),
         )
         for task, split in pairs
     ]
+
+
+def make(sets: Sequence[DemoSet], config: GenConfig) -> list[DemoJob]:
+    """Make what is missing, merging each task as soon as it has all; return the jobs given up.
+
+    Raises:
+        UsageError: nothing can be made on this machine, or files are in the way.
+    """
+    missing = {demos: missing_jobs(demos, config.demos) for demos in sets}
+    left = {demos: len(jobs) for demos, jobs in missing.items()}
+    for demos in sets:
+        if not left[demos]:  # stopped between the last demo and the merge, or finished before
+            finish(demos, config.demos)
+    jobs, lost = list(chain.from_iterable(missing.values())), []
+    started = time.perf_counter()
+    with closing(generate(jobs, config.workers)) as ended:
+        for job in ended:
+            left[job.demos] -= not job.given_up
+            if job.given_up:
+                lost.append(job)
+            elif not left[job.demos]:
+                finish(job.demos, config.demos)
+    if jobs:
+        seconds = time.perf_counter() - started
+        print(f"{len(jobs)} demos in {seconds:.0f} s: {len(jobs) / seconds:.2f} demos/s")
+    return lost
 
 
 def missing_jobs(demos: DemoSet, count: int) -> list[DemoJob]:
@@ -133,19 +153,28 @@ def missing_jobs(demos: DemoSet, count: int) -> list[DemoJob]:
     return [DemoJob(demos, index) for index in wanted if not has_part(demos, index)]
 
 
-def generate(jobs: Sequence[DemoJob], workers: int) -> list[DemoJob]:
-    """Make the parts of all jobs; return the jobs given up.
+def generate(jobs: Sequence[DemoJob], workers: int) -> Generator[DemoJob, None, None]:
+    """Make the parts of all jobs; yield each job when its part is there or it is given up.
 
     Raises:
         UsageError: nothing can be made on this machine.
     """
-    lost: list[DemoJob] = []
+    made, trials = 0, 0
     with tqdm(total=len(jobs), unit="demo", disable=not sys.stderr.isatty()) as bar:
         while jobs:
-            unfinished = list(_unfinished(jobs, workers, bar))
-            lost += [job for job in unfinished if len(job.failures) == MAX_FAILURES]
-            jobs = [job for job in unfinished if len(job.failures) < MAX_FAILURES]
-    return lost
+            again = []
+            for job, failure in _tried(jobs, workers):
+                if failure is None:
+                    made, trials = made + 1, trials + 1 + len(job.failures)
+                    bar.set_postfix_str(f"expert {made}/{trials}", refresh=False)
+                    bar.update()
+                else:
+                    bar.write(f"demo {job.index} of {job.demos.task}: {failure}", sys.stderr)
+                if failure is None or job.given_up:
+                    yield job
+                else:
+                    again.append(job)
+            jobs = again
 
 
 def finish(demos: DemoSet, count: int) -> None:
@@ -155,20 +184,15 @@ def finish(demos: DemoSet, count: int) -> None:
     drop_parts(demos)
 
 
-def _unfinished(jobs: Sequence[DemoJob], workers: int, bar: tqdm) -> Iterator[DemoJob]:
-    """Run all jobs once; yield those to be run again, as they should be run."""
-    made, failed = 0, 0
+def _tried(jobs: Sequence[DemoJob], workers: int) -> Iterator[tuple[DemoJob, str | None]]:
+    """Run all jobs once; yield each with the scenes it failed in, and why it is not made yet."""
     with closing(run_jobs(jobs, EXPERT, workers)) as results:
         for job, result in results:
             if isinstance(result, JobFailure):
-                bar.write(f"demo {job.index} of {job.demos.task}: {result.reason}", sys.stderr)
-                yield job.after(result)
-            elif len(result) == MAX_FAILURES:
-                yield replace(job, failures=result)
+                yield job.after(result), result.reason
             else:
-                made, failed = made + 1, failed + len(result)
-                bar.set_postfix_str(f"expert {made}/{made + failed}", refresh=False)
-                bar.update()
+                tried = replace(job, failures=result)
+                yield tried, f"given up ({result[-1].reason})" if tried.given_up else None
 
 
 def _report(sets: Sequence[DemoSet]) -> None:
@@ -194,12 +218,8 @@ def _check_writable(folder: Path) -> None:
     probe.unlink()
 
 
-def _code_version() -> str:
-    try:
-        return version("sacil")
-    except PackageNotFoundError:
-        return "uninstalled"
-
-
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(GenConfig)))
+    run_command(
+        lambda: main(tyro.cli(GenConfig)),
+        after_stop="The same command again makes the missing demos.",
+    )

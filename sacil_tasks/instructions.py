@@ -1,4 +1,4 @@
-"""Slots of meaning -> sentences, and back-checks of what a user asks for. Pure."""
+"""Slots of meaning -> sentences (D-words), and back-checks of what a user asks for. Pure."""
 
 import re
 from itertools import permutations, product

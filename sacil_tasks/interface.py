@@ -30,6 +30,7 @@ class SceneBounds:
     side_m: float
 
 
+# D-cube: smaller than RVT's workspace.
 SCENE_BOUNDS = SceneBounds(center_in_base=(0.535, 0.0, 0.33), side_m=0.72)
 
 

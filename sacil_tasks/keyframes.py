@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path
+from sacil_tasks.files import atomic_hdf5
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, Keyframe, Observation
 
 KIND = "sacil-keyframes"
@@ -112,7 +112,7 @@ def write_keyframes(path: Path, demos: Sequence[KeyframeDemo], meta: KeyframeMet
     Raises:
         UsageError: the folder cannot be written or the disk is full.
     """
-    with atomic_path(path) as draft, h5py.File(draft, "w") as file:
+    with atomic_hdf5(path) as file:
         create_tables(file, rows=sum(len(d.observations) for d in demos), episodes=len(demos))
         first_row = 0
         for episode_id, demo in enumerate(demos):
@@ -231,6 +231,7 @@ def _observation_columns(
         "next_index": np.array(_next_rows(first_row, count)),
         "keyframe_in_base": np.array([*commanded, np.full(7, np.nan)]),
         "keyframe_open": np.array([*(k.gripper_open for k in asked), False]),
+        # D-collision: each keyframe's own label.
         "keyframe_ignore_collisions": np.array([*(k.ignore_collisions for k in asked), False]),
         "target_index": np.array([*demo.targets, NO_ROW]),
         "candidate_in_base": demo.candidate_in_base,

@@ -1,4 +1,4 @@
-"""Why an episode ended as it did: one code, first match wins. Pure."""
+"""Why an episode ended as it did: one code, first match wins (D-success). Pure."""
 
 from dataclasses import dataclass
 

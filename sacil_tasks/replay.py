@@ -17,6 +17,7 @@ import tyro
 from jaxtyping import Float
 from tqdm import tqdm
 
+from sacil_tasks.catalog import env_id, task_names
 from sacil_tasks.demos import read_records
 from sacil_tasks.errors import UsageError, run_command
 
@@ -56,6 +57,8 @@ def main(config: ReplayConfig) -> None:
             "Make demos with `python -m sacil_tasks.gen_demos`."
         )
     work = [(folder, read_records(folder)[: config.count]) for folder in folders]
+    for folder in folders:
+        _env_info(folder)
     results = []
     with tqdm(
         total=sum(len(records) for _, records in work),
@@ -84,7 +87,7 @@ def replay(folder: Path, records: list[dict[str, Any]]) -> Iterator[Replayed]:
     """Play the actions of each record in a simulator that renders nothing."""
     import gymnasium as gym  # after all checks: this starts the simulator
 
-    info = json.loads((folder / "trajectory.json").read_text())["env_info"]
+    info = _env_info(folder)
     env: Any = gym.make(info["env_id"], render_backend="none", **info["env_kwargs"]).unwrapped
     try:
         with h5py.File(folder / "trajectory.h5", "r") as file:
@@ -101,6 +104,17 @@ def replay(folder: Path, records: list[dict[str, Any]]) -> Iterator[Replayed]:
                 )
     finally:
         env.close()
+
+
+def _env_info(folder: Path) -> dict[str, Any]:
+    info = json.loads((folder / "trajectory.json").read_text()).get("env_info", {})
+    ours = {f"sacil_tasks:{env_id(task)}" for task in task_names()}
+    if info.get("env_id") not in ours:
+        raise UsageError(
+            f"{folder / 'trajectory.json'} holds demos of {info.get('env_id')}, which is no task "
+            "of ours. Replay them with `python -m mani_skill.trajectory.replay_trajectory`."
+        )
+    return info
 
 
 def _points_m(env: Any) -> Float[np.ndarray, "4 3"]:

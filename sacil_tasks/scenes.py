@@ -185,7 +185,8 @@ def _draw_on_spots(rng: np.random.Generator, fixture: Fixture) -> Float64[np.nda
 
 
 def _draw_colours(rng: np.random.Generator, partition: str) -> Float64[np.ndarray, "3 3"]:
-    """Validation and test have one colour for all; half of the training scenes are mixed."""
+    """Validation and test have one colour for all; half of the training scenes are mixed
+    (D-colours)."""
     picks = rng.integers(len(COLOURS), size=CANDIDATES)
     if rng.random() < 0.5 or partition != "train":
         picks[:] = picks[0]

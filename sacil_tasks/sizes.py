@@ -1,7 +1,8 @@
 """Size ladders: which sizes stand on the table under which split, named by rank alone.
 
 A family has one geometric ladder; a scene holds three consecutive rungs of it. The split chooses
-the rungs after everything else of the scene is drawn, so it never moves an object. Pure numpy.
+the rungs after everything else of the scene is drawn, so it never moves an object (D-sizes).
+Pure numpy.
 """
 
 from collections.abc import Sequence

@@ -2,6 +2,7 @@
 
 A task adds the candidates' shape, where they rest, what counts as handled, the success predicate
 and the expert's keyframes. World frame: table top at z = 0, robot base at x = -0.615.
+Scenes are our own, in SAPIEN (D-simulator).
 """
 
 from typing import Any, ClassVar

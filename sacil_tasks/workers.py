@@ -154,18 +154,20 @@ def _serve(pipe: Connection) -> None:
     """Life of a worker: receive the handler factory, then jobs, until the parent is gone."""
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # before the handler imports anything
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    factory: HandlerFactory = pipe.recv()
-    handle: Callable[[Any], Any] | None = None
-    while True:
-        job = pipe.recv()
-        try:
-            handle = handle or _load(factory)()
-            answer = handle(job)
-        except UsageError as error:
-            answer = error
-        except Exception as error:
-            answer = JobFailure(f"{type(error).__name__}: {error}", details=traceback.format_exc())
-        pipe.send(answer)
+    with suppress(EOFError, ConnectionError):  # a parent that is killed may close the pipe first
+        factory: HandlerFactory = pipe.recv()
+        handle: Callable[[Any], Any] | None = None
+        while True:
+            job = pipe.recv()
+            try:
+                handle = handle or _load(factory)()
+                answer = handle(job)
+            except UsageError as error:
+                answer = error
+            except Exception as error:
+                reason = f"{type(error).__name__}: {error}"
+                answer = JobFailure(reason, details=traceback.format_exc())
+            pipe.send(answer)
 
 
 def _load(factory: HandlerFactory) -> Callable[[], Callable[[Any], Any]]:

@@ -135,3 +135,17 @@ def test_departures_from_the_paper_are_listed():
     assert named <= listed
     places = set(re.findall(r"`((?:sacil_tasks|baselines|sacil_agent|leaderboard)/[^`]*)`", table))
     assert not [place for place in places if not (ROOT / place).exists()]
+
+
+def test_every_departure_has_a_row_and_a_pointer_in_the_file_it_names():
+    rows = re.findall(
+        r"^\| (D-[a-z-]+) \|.*\| (`[^|]*`) \|$", (ROOT / "DEVIATIONS.md").read_text(), re.MULTILINE
+    )
+    pointers = {
+        (name, str(path.relative_to(ROOT)))
+        for path in MODULES
+        for name in re.findall(r"\bD-[a-z]+(?:-[a-z]+)*", path.read_text())
+    }
+    listed = {(name, path) for name, places in rows for path in re.findall(r"`([^`]+)`", places)}
+    assert {name for name, _ in rows} == {name for name, _ in pointers}
+    assert listed <= pointers, "rows that name a file without a pointer"

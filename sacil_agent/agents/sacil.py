@@ -144,8 +144,8 @@ class Sacil(Network):
         tokens, skips = self.visual_tokens(inputs.views, self.position)
         sentence = self.sentence(last_token(inputs))
         read = self._read(tokens, sentence)
-        # Proprioception enters here and not before: the time step alone would tell Image-Text
-        # Contrast which samples are first keyframes.
+        # Proprioception enters here and not before (D-proprio-late): the time step alone would
+        # tell Image-Text Contrast which samples are first keyframes.
         tokens = tokens + self.proprio(inputs.proprio)[:, None]
         tokens, queries = self._join(tokens, read.queries, inputs)
         situation = tokens if self.queries is None else queries

@@ -7,12 +7,14 @@ import synthetic
 import torch
 from safetensors.torch import load_file, save
 
-from baselines import agent, checkpoint
+from baselines import agent, checkpoint, release
 from baselines.agent import Recipe, find_agent
 from baselines.batch import Inputs
 from baselines.checkpoint import CONFIG, MODEL, PROVENANCE, STATE, TEXT, Identity, TrainState
 from baselines.configs import restore
+from baselines.release import ReleaseConfig
 from baselines.text import SentenceTable, TextSpec
+from sacil_tasks.catalog import suite_tasks
 from sacil_tasks.errors import UsageError
 
 TEXT_SPEC = TextSpec("fake", 8, 32, "0" * 64)
@@ -166,6 +168,24 @@ def test_an_unfinished_run_is_not_released(folder, tmp_path):
     with pytest.raises(UsageError, match="not finished"):
         checkpoint.export_release(folder, tmp_path / "released")
     assert not (tmp_path / "released").exists()
+
+
+def test_a_release_is_named_after_the_suite_it_was_trained_on(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(release, "released_folder", lambda agent: tmp_path / agent)
+    with pytest.raises(UsageError, match="no suite called 'slyce'"):
+        release.main(ReleaseConfig(run=folder, suite="slyce"))
+    with pytest.raises(UsageError, match="trained on pick_and_lift, pick_up_cup, but the suite"):
+        release.main(ReleaseConfig(run=folder))
+    assert not (tmp_path / "tiny").exists()
+    edit_config(folder, tasks=suite_tasks("slice"))
+    release.main(ReleaseConfig(run=folder))
+    assert (tmp_path / "tiny" / "slice" / MODEL).is_file()
+
+
+def test_embeddings_of_another_encoder_are_named_by_their_fingerprint(folder):
+    edit_config(folder, text=asdict(replace(TEXT_SPEC, fingerprint="1" * 64)))
+    with pytest.raises(UsageError, match=r"fake \(000000000000\), but .* fake \(111111111111\)"):
+        checkpoint.load(folder, agent="tiny")
 
 
 def test_the_hash_names_weights_and_config(folder, identity):

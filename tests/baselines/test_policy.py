@@ -53,6 +53,10 @@ def observations() -> list[Observation]:
     return [synthetic.observation(rng, step) for step in range(2)]
 
 
+def test_a_policy_names_its_weights_for_the_records(folder: Path, policy: KeyframePolicy) -> None:
+    assert policy.checkpoint_sha256 == checkpoint.sha256(folder)
+
+
 def test_keyframes_lie_in_the_scene_in_the_types_of_the_contract(policy: KeyframePolicy) -> None:
     memory = policy.begin("lift the small block")
     keyframes, memories = policy.act(observations()[:1], [memory])

@@ -99,6 +99,16 @@ def test_keyframes_at_which_words_decide_have_the_share_asked_for(keyframes, sha
     assert rows[1] == pytest.approx(rows[2], rel=0.15), "later keyframes stay alike"
 
 
+def test_each_choice_of_each_task_is_drawn_alike(keyframes):
+    first, second = keyframes.shards
+    targets = np.where(np.arange(len(second.columns["step"])) % 4 < 1, 1, 2)  # two choices a demo
+    two = replace(second, columns=second.columns | {"target_index": targets})
+    drawn = KeyframeSet([first, two]).draw(stream(3, 0, "rows"), 6000, 1.0)
+    tally = Counter((s.shard, s.row % (synthetic.KEYFRAMES + 1)) for s in drawn)
+    assert set(tally) == {(0, 0), (1, 0), (1, 1)}
+    assert all(count / len(drawn) == pytest.approx(1 / 3, abs=0.03) for count in tally.values())
+
+
 def test_words_decide_whenever_another_candidates_turn_comes(keyframes):
     columns = keyframes.shards[0].columns | {"target_index": np.array([1, 1, 2, -1, -1, 0, 0, -1])}
     shard = replace(keyframes.shards[0], columns=columns)
@@ -177,6 +187,18 @@ def test_images_stay_as_stored(keyframes):
 def test_a_missing_file_names_the_command_that_makes_it(tmp_path):
     with pytest.raises(UsageError, match="gen_demos --tasks pick_and_lift"):
         KeyframeSet.load(tmp_path, ["pick_and_lift"])
+
+
+def test_a_file_of_another_task_is_refused(tmp_path):
+    path = synthetic.write_file(tmp_path, "pick_up_cup", demos=2)
+    path.rename(path.with_name("pick_and_lift.h5"))
+    with pytest.raises(UsageError, match="keyframes of pick_up_cup, not of pick_and_lift"):
+        KeyframeSet.load(path.parent, ["pick_and_lift"])
+
+
+def test_a_draw_too_small_for_two_sizes_is_refused_instead_of_repeated_forever(keyframes):
+    with pytest.raises(ValueError, match="at least 2"):
+        keyframes.draw(stream(0, 0, "rows"), 1, None)
 
 
 def test_demos_of_one_size_cannot_teach_size(tmp_path):

@@ -142,10 +142,10 @@ def test_embeddings_are_made_once_and_kept_beside_the_demos(tmp_path, monkeypatc
 def test_data_that_cannot_be_written_can_still_be_read(tmp_path, monkeypatch, caplog):
     path = synthetic.write_file(tmp_path, "pick_and_lift", demos=2)
 
-    def refuse(source, target):
-        raise PermissionError(13, "Permission denied")
+    def refuse(path, mode):
+        raise UsageError("this folder is read-only")
 
-    monkeypatch.setattr(text.shutil, "copyfile", refuse)
+    monkeypatch.setattr(text, "atomic_hdf5", refuse)
     assert len(cached_table("minilm", {path: [SENTENCE]})[SENTENCE]) == 6
     assert "not kept" in caplog.text
 
@@ -166,7 +166,7 @@ def test_a_table_answers_known_sentences_alone_and_others_with_its_encoder(
 def test_a_table_refuses_another_encoder(monkeypatch, minilm, clip_folder):
     other = load_encoder(f"clip:{clip_folder}")
     monkeypatch.setattr(text, "load_encoder", lambda name: other)
-    with pytest.raises(UsageError, match="not the one the embeddings were made with"):
+    with pytest.raises(UsageError, match=r"is clip:.*, but .* made with minilm \(1b5f"):
         SentenceTable(minilm.spec, {})[SENTENCE]
 
 

@@ -17,6 +17,7 @@ from baselines.options import parse
 from baselines.run import Means, read_rows
 from baselines.train import main
 from sacil_tasks.errors import UsageError
+from sacil_tasks.files import sole_writer
 
 pytestmark = pytest.mark.usefixtures("tiny")
 
@@ -170,7 +171,7 @@ def test_an_unfinished_run_is_neither_overwritten_nor_changed(data, tmp_path, mo
         train(data, out)
     with pytest.raises(UsageError, match="seed 0, but 1 is asked for"):
         train(data, out, "--resume", "--seed", "1")
-    with pytest.raises(UsageError, match=r"config.recipe.lr 0.0016, but 0.1 is asked for"):
+    with pytest.raises(UsageError, match=r"config.recipe.lr 0\.\d+, but 0.1 is asked for"):
         train(data, out, "--resume", "--recipe.lr", "0.1")
     with pytest.raises(UsageError, match="agent tiny:goals, but tiny is asked for"):
         train(data, out, "--resume", name="tiny")
@@ -269,6 +270,23 @@ def test_missing_data_and_unknown_names_are_refused_before_anything_is_written(t
 def test_a_folder_that_cannot_be_written_is_named(data):
     with pytest.raises(UsageError, match=r"cannot write /proc/run"):
         train(data, Path("/proc/run"), "--steps", "2")
+
+
+def test_two_runs_on_one_folder_do_not_mix(data, tmp_path):
+    out = tmp_path / "run"
+    with sole_writer(out), pytest.raises(UsageError, match="another run is writing"):
+        train(data, out, "--steps", "2")
+    assert list(out.iterdir()) == []
+
+
+def test_a_full_disk_is_one_sentence_and_the_run_resumes(data, tmp_path, unbroken, monkeypatch):
+    flags = (data, tmp_path / "run", "--steps", "12", "--validate-every", "4")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 7, lambda: patch.setattr(run, "METRICS", "/dev/full"))
+        with pytest.raises(UsageError, match="cannot write /dev/full: No space left"):
+            train(*flags)
+    train(*flags, "--resume")
+    assert (tmp_path / "run" / MODEL).read_bytes() == (unbroken / MODEL).read_bytes()
 
 
 def test_terms_that_do_not_exist_are_left_out_of_the_mean():

@@ -49,6 +49,15 @@ def test_results_do_not_depend_on_workers_or_on_what_was_played_before(oracle, t
     assert reproducible(again) == reproducible(oracle)
 
 
+def test_pixels_do_not_depend_on_workers_or_on_what_was_drawn_before(tmp_path):
+    """The oracle does not look; this policy is shown the first images of each episode."""
+    chosen = {"agent": "rogue_policies:load_wanderer", "tasks": ("pick_and_lift",)}
+    one, two = (evaluate(tmp_path / str(n), workers=n, **chosen) for n in (1, 2))
+    assert reproducible(one) == reproducible(two)
+    assert len({record.pixels for record in one}) == 2, "two scenes, each the same for all words"
+    assert all(record.pixels for record in one)
+
+
 def test_agents_meet_the_same_scenes(oracle, hold):
     assert {r.key: r.fingerprint for r in oracle} == {r.key: r.fingerprint for r in hold}
 

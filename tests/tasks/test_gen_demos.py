@@ -13,6 +13,7 @@ import pytest
 from sacil_tasks import gen_demos
 from sacil_tasks.demos import DemoSet, read_records
 from sacil_tasks.errors import UsageError
+from sacil_tasks.files import sole_writer
 from sacil_tasks.gen_demos import GenConfig
 from sacil_tasks.keyframes import KeyframeFile
 
@@ -156,6 +157,24 @@ def test_a_demo_that_never_succeeds_fails_the_run_but_keeps_the_others(tmp_path)
 def test_wrong_names_are_refused_before_any_worker_starts(tmp_path, flags, complaint):
     with pytest.raises(UsageError, match=complaint):
         generate(tmp_path, "no_such_expert", **flags)
+
+
+def test_a_task_is_merged_as_soon_as_all_of_its_demos_are_there(tmp_path):
+    tasks = (TASK, "push_buttons")
+    with pytest.MonkeyPatch.context() as patch:
+        merged = []
+        patch.setattr(gen_demos, "merge", lambda demos, count: merged.append(demos.task) or _die())
+        with pytest.raises(KeyboardInterrupt):
+            generate(tmp_path, tasks=tasks)
+    assert merged == [TASK]
+    assert not list((demos_of(tmp_path).parent / "push_buttons").glob("parts/000004.h5"))
+    generate(tmp_path, tasks=tasks)
+    assert len(read_records(demos_of(tmp_path))) == 5
+
+
+def test_two_runs_on_one_folder_do_not_mix(tmp_path):
+    with sole_writer(demos_of(tmp_path)), pytest.raises(UsageError, match="another run is writing"):
+        generate(tmp_path, "no_such_expert")
 
 
 def test_demos_of_another_scene_set_are_not_mixed_in(tmp_path):

@@ -1,0 +1,81 @@
+"""The committed results belong to this code, and README says what they say."""
+
+import csv
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from baselines.checkpoint import released_folder, sha256
+from leaderboard.protocol import protocol_of
+from leaderboard.records import EPISODES_FILE, EpisodeRecord, read_records
+from leaderboard.summary import write_summary
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+AGENTS = ("sacil", "rvt", "blind", "random", "hold", "oracle")
+RUNS = sorted(path.parent for path in RESULTS.rglob(EPISODES_FILE))
+
+each_run = pytest.mark.parametrize("run", RUNS, ids=lambda run: str(run.relative_to(RESULTS)))
+
+
+@cache
+def records_of(run: Path) -> list[EpisodeRecord]:
+    return read_records(run / EPISODES_FILE)
+
+
+def test_every_agent_has_a_test_run():
+    assert {RESULTS / "test" / agent for agent in AGENTS} <= set(RUNS)
+
+
+@each_run
+def test_the_summary_is_what_the_episodes_come_to(run, tmp_path):
+    write_summary(tmp_path / "summary.csv", records_of(run))
+    assert (tmp_path / "summary.csv").read_bytes() == (run / "summary.csv").read_bytes()
+
+
+@each_run
+def test_scenes_and_rules_are_those_of_this_code(run):
+    for record in records_of(run):
+        protocol = protocol_of(record.task, record.partition, record.scene_set)
+        assert record.protocol == protocol.hash, "rerun results/ after a change of the protocol"
+
+
+@each_run
+def test_weights_are_the_released_ones(run):
+    agent = records_of(run)[0].agent
+    released = released_folder(agent) / "slice" if agent in ("sacil", "rvt") else None
+    expected = sha256(released) if released else None
+    assert {record.checkpoint for record in records_of(run)} == {expected}
+
+
+def test_all_agents_met_the_same_scenes():
+    shown: dict[tuple, set[str]] = {}
+    for run in RUNS:
+        for record in records_of(run):
+            shown.setdefault(record.key, set()).add(record.fingerprint)
+    assert all(len(fingerprints) == 1 for fingerprints in shown.values())
+
+
+def test_readme_has_the_table():
+    readme = (ROOT / "README.md").read_text()
+    for line in table():
+        assert line in readme, "paste:\n" + "\n".join(table())
+
+
+def table() -> Iterator[str]:
+    """Rows of README's table: strict success, interval and count of each agent."""
+    cells = {}
+    for agent in AGENTS:
+        with (RESULTS / "test" / agent / "summary.csv").open() as file:
+            for row in csv.DictReader(file):
+                cells[row["task"], row["split"], agent] = cell(row)
+    for task, split in dict.fromkeys(key[:2] for key in cells):
+        shown = " | ".join(cells[task, split, agent] for agent in AGENTS)
+        yield f"| {task} | {split} | {shown} |"
+
+
+def cell(row: dict[str, str]) -> str:
+    percent = f"{row['rate_percent']} ({row['low_percent']}-{row['high_percent']})"
+    return f"{percent}, {row['successes']}/{row['episodes']}"
