@@ -182,13 +182,19 @@ class KeyframeExecutor:
     def _without_lag(self, motion: JointPath) -> JointPath:
         """Targets that make the joints be where they should be after each control step.
 
-        The PD controller follows a target like a first-order lag of damping / stiffness
-        seconds; left alone, the arm would trail by up to 0.12 rad and leave the checked path.
+        The PD controller is a spring and a damper that pull the arm's inertia. The damper makes
+        it follow a target like a first-order lag of damping / stiffness seconds: left alone, it
+        would trail by up to 0.12 rad. The inertia carries it on where it brakes: left alone, the
+        tool would dip by up to 7 mm at the end of a descent. Either would leave the checked path.
         """
-        agent = self._base.agent
-        lag_steps = agent.arm_damping / agent.arm_stiffness * self._base.control_freq
+        agent, rate_hz = self._base.agent, self._base.control_freq
         before = np.concatenate([self._joints()[None], motion[:-1]])
+        speeds = np.pad(motion - before, ((1, 1), (0, 0))) * rate_hz
+        accelerations = np.gradient(speeds, axis=0)[1:-1] * rate_hz
+        inertias = np.array([self._arm.inertia(joints) for joints in motion])
+        lag_steps = agent.arm_damping / agent.arm_stiffness * rate_hz
         targets = before + (motion - before) / (1 - np.exp(-1 / lag_steps))
+        targets += np.einsum("nij,nj->ni", inertias, accelerations) / agent.arm_stiffness
         return np.clip(targets, self._arm.lower, self._arm.upper)
 
     def _hold(self, target: Joints) -> None:

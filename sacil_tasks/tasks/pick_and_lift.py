@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
-from sacil_tasks.poses import downwards
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.scenes import Layout
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
@@ -79,7 +79,7 @@ class PickAndLiftEnv(SizedTableEnv):
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         edge_m, (at, yaw) = self.sizes_m[choice[0]], self._start_pose(choice[0])
         above = np.array([at[0], at[1], edge_m + 0.08])
-        grasp = np.array([at[0], at[1], max(edge_m / 2, 0.0115)])
+        grasp = np.array([at[0], at[1], grasp_height_m(edge_m)])
         lift = grasp + np.array([0, 0, 0.10])
         goal = self.goal.pose.p[0].cpu().numpy() + np.array([0, 0, grasp[2] - edge_m / 2])
         return [
