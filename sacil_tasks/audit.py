@@ -33,9 +33,9 @@ from sacil_tasks.verdicts import Finding, Row
 from sacil_tasks.workers import JobFailure, run_jobs
 
 Check = Literal["oracles", "shortcuts", "looks", "scripts", "expert"]
+SizeSplit = Literal["canon", "shift_down", "shift_up"]
 
 TRIALS_FILE, FINDINGS_FILE = "trials.jsonl", "audit.csv"
-SIZE_SPLITS = ("canon", "shift_down", "shift_up")
 
 
 class Trial(NamedTuple):
@@ -63,6 +63,9 @@ class AuditConfig:
 
     checks: tuple[Check, ...] = get_args(Check)
     """What to check; without it, everything."""
+
+    splits: tuple[SizeSplit, ...] = get_args(SizeSplit)
+    """Size splits that are looked at and played; a task without one is passed over."""
 
     resets: int = 5000
     """Scenes that the shortcut classifiers see, per task."""
@@ -124,7 +127,7 @@ def plan(config: AuditConfig) -> list[Trial]:
         for check in counts
         if check in config.checks
         for task in _tasks(config)
-        for split in _splits(task, check)
+        for split in _splits(config, task, check)
         for start in range(0, counts[check], _PER_TRIAL[check])
     ]
 
@@ -220,10 +223,10 @@ def _tasks(config: AuditConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys(task_spec(name).name for name in names))
 
 
-def _splits(task: str, check: str) -> tuple[str, ...]:
+def _splits(config: AuditConfig, task: str, check: str) -> tuple[str, ...]:
     if check in ("shortcuts", "scripts"):
         return ("canon",)
-    return tuple(split for split in SIZE_SPLITS if split in task_spec(task).splits)
+    return tuple(split for split in config.splits if split in task_spec(task).splits)
 
 
 _JUDGES: dict[str, Callable[[str, str, Sequence[Row]], list[Finding]]] = {

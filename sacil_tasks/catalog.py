@@ -1,5 +1,4 @@
-"""Task names -> what they stand for. A task is one file in `sacil_tasks/tasks/`, nothing else;
-three of the nine tasks so far (D-partial).
+"""Task names -> what they stand for. A task is one file in `sacil_tasks/tasks/`, nothing else.
 
 The file `pick_and_lift.py` holds the literal `SPEC = TaskSpec(...)` and `class PickAndLiftEnv`.
 The spec is read from the source text, so that asking for a task's words or splits starts neither
