@@ -47,7 +47,7 @@ class ContactLog:
             if (first in self._robot) == (second in self._robot):
                 continue
             link, thing = (first, second) if first in self._robot else (second, first)
-            if link in self._fingers and thing in self._touchable | _bodies(handles()):
+            if link in self._fingers and (thing in self._touchable or thing in _bodies(handles())):
                 continue
             self._note(link.entity.name, thing.entity.name, contact)
 

@@ -194,7 +194,9 @@ class SizedTableEnv(BaseEnv):
 
         A function of the scene as it was reset, so that all can be asked for at once.
         """
-        return self._expert_keyframes(choice)[index]
+        if choice not in self._expert_plans:
+            self._expert_plans[choice] = self._expert_keyframes(choice)
+        return self._expert_plans[choice][index]
 
     def expert_target(self, index: int) -> int | None:
         """Position in `choice` of the candidate that keyframe `index` serves, if it serves one."""
@@ -408,6 +410,8 @@ class SizedTableEnv(BaseEnv):
         sizes_asked = self._asked[:, : len(self.task.slots)]
         named = self._labels[:, None] == sizes_asked[..., None]
         self._targets = named.int().argmax(-1)
+        # They depend on the scene as it was reset and on the words, so they are forgotten here.
+        self._expert_plans: dict[tuple[int, ...], list[Keyframe]] = {}
         self._present = self._variant.present(named.any(1))
         self._unnamed = ~named.any(1) & self._present
 
