@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from baselines.augment import AugmentConfig
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.sight import Sight
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError, find_name
 
@@ -62,7 +63,7 @@ class Recipe:
     """Random rigid moves of cloud and action together."""
 
     image_noise: float = 0.0
-    """Largest amplitude of the uniform noise added to the views (RVT: 0.1)."""
+    """Largest amplitude of the uniform noise added to virtual views (RVT: 0.1)."""
 
     precision: Literal["fp32", "bf16"] = "fp32"
     """Arithmetic of forward and backward; weights and optimiser are always fp32."""
@@ -88,10 +89,6 @@ class AgentConfig(Protocol):
     """What the trainer reads of an agent's config: a frozen dataclass of the agent's own."""
 
     @property
-    def pixels(self) -> int:
-        """Pixels per side of a virtual view."""
-
-    @property
     def recipe(self) -> Recipe:
         """How to train it."""
 
@@ -99,8 +96,11 @@ class AgentConfig(Protocol):
 class Network(nn.Module):
     """A keyframe predictor; dropout draws from torch's global generator, seeded every step."""
 
+    sight: Sight
+    """What it reads of a scene."""
+
     needs_goals: bool = False
-    """Whether `loss` reads `Batch.goal_views`."""
+    """Whether `loss` reads `Batch.goal`."""
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The training loss, and its terms and diagnostics as detached scalars.

@@ -4,17 +4,26 @@ Positions are in cube coordinates ([-1, 1] on each axis spans `interface.SCENE_B
 """
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+Scene = TypeVar("Scene")
+"""What the network's `baselines.sight.Sight` makes of an observation: a dataclass of tensors."""
+
 
 @dataclass(frozen=True)
-class Inputs:
+class Inputs(Generic[Scene]):
     """What an agent may see before it chooses a keyframe."""
 
-    views: Float[Tensor, "b v 7 h w"]
-    """Virtual views: xyz (cube), rgb ([0, 1]), depth; see `baselines.views`."""
+    scene: Scene
+
+    gripper_in_cube: Float[Tensor, "b 7"]
+    """Gripper pose: position in the cube, quaternion wxyz."""
+
+    step: Int64[Tensor, "b"]
+    """Keyframes executed before."""
 
     proprio: Float[Tensor, "b 2"]
     """Gripper open (0 or 1) and time, from 1 at the first keyframe down to -1."""
@@ -31,21 +40,24 @@ class Labels:
     """The expert's keyframe, in the frame of the augmented cube."""
 
     position_in_cube: Float[Tensor, "b 3"]
+    quaternion_wxyz: Float[Tensor, "b 4"]
+    """Of the twins half a turn apart, the one that `rotation.canonical_yaw` chooses."""
+
     rotation_bins: Int64[Tensor, "b 3"]
     gripper_open: Int64[Tensor, "b"]
     ignore_collisions: Int64[Tensor, "b"]
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Generic[Scene]):
     """One training step."""
 
-    inputs: Inputs
+    inputs: Inputs[Scene]
     labels: Labels
 
-    goal_views: Float[Tensor, "b v 7 h w"] | None
-    """Views of the observation at the keyframe to be reached, with their own augmentation;
-    None unless the network asks for goals."""
+    goal: Scene | None
+    """The observation at the keyframe to be reached, with its own augmentation; None unless the
+    network asks for goals."""
 
     task: Int64[Tensor, "b"]
     """Index of the task in the training set."""

@@ -1,9 +1,9 @@
-"""From four RGB-D images to one coloured point cloud in the robot base frame."""
+"""From four RGB-D images to points: one coloured cloud, or a map of points beside each image."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from baselines.compiled import compiled
 
@@ -31,7 +31,7 @@ def unproject(
 
     Pixels whose depth is 0 saw nothing and are dropped, so the cloud may be empty.
     """
-    rays = METRES_PER_MILLIMETRE * camera_in_base[:, :3, :3] @ np.linalg.inv(intrinsics)
+    rays = _rays(intrinsics, camera_in_base)
     xyz_in_base = np.empty((depth_mm.size, 3), np.float32)
     colours = np.empty((depth_mm.size, 3), np.uint8)
     count = _lift(
@@ -43,6 +43,33 @@ def unproject(
         colours,
     )
     return Cloud(xyz_in_base=xyz_in_base[:count], rgb=colours[:count])
+
+
+def point_maps(
+    depth_mm: UInt16[np.ndarray, "k h w"],
+    intrinsics: Float32[np.ndarray, "k 3 3"],
+    camera_in_base: Float32[np.ndarray, "k 4 4"],
+    cube_from_base: Float32[np.ndarray, "3 4"],
+) -> tuple[Float32[np.ndarray, "k 3 h w"], Bool[np.ndarray, "k h w"]]:
+    """Cube coordinates of every pixel's point, and whether it lies in [-1, 1]^3.
+
+    `cube_from_base` includes the augmentation. Pixels that saw nothing, or something outside, are
+    at 0.
+    """
+    turn, shift = cube_from_base[:, :3], cube_from_base[:, 3]
+    rays = turn @ _rays(intrinsics, camera_in_base)
+    origins = camera_in_base[:, :3, 3] @ turn.T + shift
+    maps = np.empty((len(depth_mm), 3, *depth_mm.shape[1:]), np.float32)
+    inside = np.empty(depth_mm.shape, np.bool_)
+    _map(depth_mm, rays.astype(np.float32), origins.astype(np.float32), maps, inside)
+    return maps, inside
+
+
+def _rays(
+    intrinsics: Float32[np.ndarray, "k 3 3"], camera_in_base: Float32[np.ndarray, "k 4 4"]
+) -> Float32[np.ndarray, "k 3 3"]:
+    """Displacement (m) per millimetre of depth of the pixel (column, row, 1)."""
+    return METRES_PER_MILLIMETRE * camera_in_base[:, :3, :3] @ np.linalg.inv(intrinsics)
 
 
 @compiled
@@ -80,3 +107,28 @@ def _lift(
                 colours[count, 2] = rgb[k, i, j, 2]
                 count += 1
     return count
+
+
+@compiled
+def _map(
+    depth_mm: np.ndarray,
+    rays: np.ndarray,
+    origins: np.ndarray,
+    maps: np.ndarray,
+    inside: np.ndarray,
+) -> None:
+    half, one, nothing = np.float32(0.5), np.float32(1), np.float32(0)
+    for k in range(depth_mm.shape[0]):
+        ray, origin = rays[k], origins[k]
+        for i in range(depth_mm.shape[1]):
+            v = np.float32(i) + half
+            for j in range(depth_mm.shape[2]):
+                depth, u = np.float32(depth_mm[k, i, j]), np.float32(j) + half
+                x = (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) * depth + origin[0]
+                y = (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) * depth + origin[1]
+                z = (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) * depth + origin[2]
+                hit = depth > nothing and max(abs(x), abs(y), abs(z)) <= one
+                inside[k, i, j] = hit
+                maps[k, 0, i, j] = x if hit else nothing
+                maps[k, 1, i, j] = y if hit else nothing
+                maps[k, 2, i, j] = z if hit else nothing

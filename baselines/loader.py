@@ -1,30 +1,24 @@
-"""Samples -> batches: unproject, augment, draw the virtual views, label.
+"""Samples -> batches: choose, move, look, label.
 
 Runs on the training thread: on one core a second thread would win nothing.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from baselines import augment
 from baselines.agent import Recipe
-from baselines.augment import Augmentation
 from baselines.batch import Batch, Inputs, Labels, proprio
-from baselines.cloud import unproject
 from baselines.rotation import canonical_yaw, quaternion_to_bins
 from baselines.samples import KeyframeSet, Sample, stream
+from baselines.sight import Moment, Sight
 from baselines.text import SentenceTable, pad
-from baselines.views import CHANNELS, VIEWS, cube_from_base, render_views
-
-Move: TypeAlias = Callable[[Float32[np.ndarray, "7"]], Augmentation]
-"""Chooses how a scene is moved, given the pose its move pivots on."""
-
-STILL = Augmentation(0.0, np.zeros(3))
+from baselines.views import apply_affine, cube_from_base
+from sacil_tasks.interface import Observation
 
 
 class Loader:
@@ -35,15 +29,15 @@ class Loader:
         keyframes: KeyframeSet,
         text: SentenceTable,
         *,
-        pixels: int,
+        sight: Sight,
         recipe: Recipe,
         seed: int,
         goals: bool,
     ) -> None:
-        """`goals` asks for the views of the observation each sample leads to."""
+        """`goals` asks for the observation that each sample leads to."""
         self.keyframes = keyframes
         self._text = text
-        self._pixels = pixels
+        self._sight = sight
         self._recipe = recipe
         self._seed = seed
         self._goals = goals
@@ -58,55 +52,39 @@ class Loader:
         """
         rng = stream(self._seed, step, "rows")
         samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.choice_share)
-        views, moves = self.views(samples, self._mover(step, "moves"))
-        goals = None
-        if self._goals:
-            goals, _ = self.views(self._next(samples), self._mover(step, "goals"))
-        if self._recipe.image_noise:
-            self._add_noise([views] if goals is None else [views, goals], step)
-        return self._assemble(samples, views, moves, goals)
+        goals = self._moved(self._next(samples), step, "goals") if self._goals else None
+        return self._assemble(samples, self._moved(samples, step, "moves"), goals)
 
     def plain(self, samples: Sequence[Sample]) -> Batch:
-        """A batch of these samples without augmentation, noise or goals."""
-        views, moves = self.views(samples, lambda _: STILL)
-        return self._assemble(samples, views, moves, None)
+        """A batch of these samples without augmentation or goals."""
+        moments = [
+            Moment(self.keyframes.shards[s.shard].observation(s.row), before=self._before(s))
+            for s in samples
+        ]
+        return self._assemble(samples, moments, None)
 
-    def _mover(self, step: int, name: str) -> Move:
-        rng = stream(self._seed, step, name)
-        return lambda pivot: augment.draw(rng, pivot[:3], self._recipe.augment)
+    def _moved(self, samples: Sequence[Sample], step: int, name: str) -> list[Moment]:
+        """Each sample with a move of its own; `name` is the stream that it is drawn from."""
+        rng, points = stream(self._seed, step, name), stream(self._seed, step, "points")
+        return [self._moment(sample, rng, int(points.integers(2**31))) for sample in samples]
+
+    def _moment(self, sample: Sample, rng: np.random.Generator, seed: int) -> Moment:
+        shard = self.keyframes.shards[sample.shard]
+        pivot = shard.target_in_base(sample.row)[:3]
+        move = augment.draw(rng, pivot, self._recipe.augment)
+        return Moment(shard.observation(sample.row), move, self._before(sample), seed)
+
+    def _before(self, sample: Sample) -> Sequence[Observation]:
+        if not self._sight.remembers:
+            return ()
+        return self.keyframes.shards[sample.shard].before(sample.row)
 
     def _next(self, samples: Sequence[Sample]) -> list[Sample]:
         shards = self.keyframes.shards
         return [Sample(s.shard, int(shards[s.shard].columns["next_index"][s.row])) for s in samples]
 
-    def views(self, samples: Sequence[Sample], mover: Move) -> tuple[Tensor, list[Augmentation]]:
-        """Views of each sample's scene after its own move, and the moves."""
-        side = self._pixels
-        views = np.empty((len(samples), len(VIEWS), len(CHANNELS), side, side), np.float32)
-        moves = []
-        for sample, out in zip(samples, views, strict=True):
-            shard = self.keyframes.shards[sample.shard]
-            move = mover(shard.target_in_base(sample.row))
-            seen = shard.observation(sample.row)
-            cloud = unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
-            render_views(cloud.xyz_in_base, cloud.rgb, move.to_cube(), side, out)
-            moves.append(move)
-        return torch.from_numpy(views), moves
-
-    def _add_noise(self, views: Sequence[Tensor], step: int) -> None:
-        """RVT's image noise, in place: one amplitude a batch, then uniform on every value."""
-        rng = stream(self._seed, step, "noise")
-        for tensor in views:
-            amplitude = np.float32(rng.uniform(0, self._recipe.image_noise))
-            unit = rng.random(tuple(tensor.shape), np.float32)
-            tensor.add_(torch.from_numpy(amplitude * (2 * unit - 1))).clamp_(-1, 1)
-
     def _assemble(
-        self,
-        samples: Sequence[Sample],
-        views: Tensor,
-        moves: Sequence[Augmentation],
-        goals: Tensor | None,
+        self, samples: Sequence[Sample], moments: Sequence[Moment], goals: list[Moment] | None
     ) -> Batch:
         keyframes, shards = self.keyframes, self.keyframes.shards
         episodes = [keyframes.episode(sample) for sample in samples]
@@ -115,45 +93,36 @@ class Loader:
             s.row == shards[s.shard].first_rows[e] for s, e in zip(samples, episodes, strict=True)
         ]
         return Batch(
-            inputs=self._inputs(samples, views),
-            labels=self._labels(samples, moves),
-            goal_views=goals,
+            inputs=self._inputs(samples, moments),
+            labels=self._labels(samples, moments),
+            goal=None if goals is None else self._sight.look(goals),
             task=torch.tensor([sample.shard for sample in samples]),
             meaning=torch.tensor([keyframes.meaning_ids[keyframes.meaning(s)] for s in samples]),
             trajectory=torch.tensor(trajectories),
             first=torch.tensor(firsts),
         )
 
-    def _inputs(self, samples: Sequence[Sample], views: Tensor) -> Inputs:
-        seen = [self.keyframes.shards[s.shard].observation(s.row) for s in samples]
-        text, mask = pad([self._text[self._sentence(s)] for s in samples], self._text_length)
-        state = [
-            proprio(gripper_open=o.gripper_open, step=o.step, max_steps=o.max_steps) for o in seen
-        ]
-        return Inputs(
-            views=views,
-            proprio=torch.tensor(state),
-            text=torch.from_numpy(text),
-            text_mask=torch.from_numpy(mask),
-        )
+    def _inputs(self, samples: Sequence[Sample], moments: Sequence[Moment]) -> Inputs:
+        words = pad([self._text[self._sentence(s)] for s in samples], self._text_length)
+        return inputs_of(self._sight, moments, *words)
 
     def _sentence(self, sample: Sample) -> str:
         shard = self.keyframes.shards[sample.shard]
         return shard.episodes[self.keyframes.episode(sample)].instruction
 
-    def _labels(self, samples: Sequence[Sample], moves: Sequence[Augmentation]) -> Labels:
+    def _labels(self, samples: Sequence[Sample], moments: Sequence[Moment]) -> Labels:
         shards = self.keyframes.shards
         poses = np.stack(
             [
-                move.move_pose(shards[s.shard].columns["keyframe_in_base"][s.row])
-                for s, move in zip(samples, moves, strict=True)
+                moment.move.move_pose(shards[s.shard].columns["keyframe_in_base"][s.row])
+                for s, moment in zip(samples, moments, strict=True)
             ]
         )
-        to_cube = cube_from_base()
-        position = poses[:, :3] @ to_cube[:, :3].T + to_cube[:, 3]
+        position, turn = apply_affine(cube_from_base(), poses[:, :3]), canonical_yaw(poses[:, 3:])
         return Labels(
             position_in_cube=torch.from_numpy(position.astype(np.float32)),
-            rotation_bins=torch.from_numpy(quaternion_to_bins(canonical_yaw(poses[:, 3:]))),
+            quaternion_wxyz=torch.from_numpy(turn.astype(np.float32)),
+            rotation_bins=torch.from_numpy(quaternion_to_bins(turn)),
             gripper_open=self._flags(samples, "keyframe_open"),
             ignore_collisions=self._flags(samples, "keyframe_ignore_collisions"),
         )
@@ -161,3 +130,22 @@ class Loader:
     def _flags(self, samples: Sequence[Sample], column: str) -> Tensor:
         shards = self.keyframes.shards
         return torch.tensor([int(shards[s.shard].columns[column][s.row]) for s in samples])
+
+
+def inputs_of(
+    sight: Sight,
+    moments: Sequence[Moment],
+    text: Float32[np.ndarray, "b t e"],
+    text_mask: Bool[np.ndarray, "b t"],
+) -> Inputs:
+    """What a network is given, in training and when it acts."""
+    seen = [moment.seen for moment in moments]
+    state = [proprio(gripper_open=o.gripper_open, step=o.step, max_steps=o.max_steps) for o in seen]
+    return Inputs(
+        scene=sight.look(moments),
+        gripper_in_cube=torch.from_numpy(np.stack([m.gripper_in_cube for m in moments])),
+        step=torch.tensor([o.step for o in seen]),
+        proprio=torch.tensor(state),
+        text=torch.from_numpy(text),
+        text_mask=torch.from_numpy(text_mask),
+    )

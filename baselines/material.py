@@ -13,6 +13,7 @@ from baselines.loader import Loader
 from baselines.options import Job
 from baselines.run import Validator
 from baselines.samples import KeyframeSet
+from baselines.sight import Sight
 from baselines.text import SentenceTable, cached_table
 from baselines.trainer import Trainer
 from baselines.validate import validate
@@ -62,14 +63,14 @@ class Material:
         loader = Loader(
             self.keyframes,
             self.text,
-            pixels=self.job.config.pixels,
+            sight=network.sight,
             recipe=self.job.config.recipe,
             seed=seed,
             goals=network.needs_goals,
         )
         return Trainer(network, loader, self.job.config.recipe, steps=steps, seed=seed)
 
-    def validator(self) -> Validator | None:
+    def validator(self, sight: Sight) -> Validator | None:
         """Scores on the `val` demos of these tasks, or None where there are none."""
         folder = _keyframes(self.job.options.data, "val")
         tasks = [task for task in self.keyframes.tasks if (folder / f"{task}.h5").is_file()]
@@ -77,12 +78,12 @@ class Material:
             log.info("no validation: no keyframes in %s", folder)
             return None
         held_out = KeyframeSet.load(folder, tasks)
-        config = self.job.config
+        recipe = self.job.config.recipe
         loader = Loader(
             held_out,
-            cached_table(config.recipe.text, sentences_of(held_out)),
-            pixels=config.pixels,
-            recipe=config.recipe,
+            cached_table(recipe.text, sentences_of(held_out)),
+            sight=sight,
+            recipe=recipe,
             seed=0,
             goals=False,
         )

@@ -15,6 +15,7 @@ from baselines.agent import Recipe
 from baselines.batch import Inputs
 from baselines.heads import ActionHead, ActionLogits
 from baselines.layers import BlockSizes, SelfBlock, linear
+from baselines.sight import Views
 from baselines.stems import (
     Maps,
     PatchDecoder,
@@ -185,3 +186,15 @@ def trimmed_text(inputs: Inputs) -> tuple[Float[Tensor, "b t e"], Bool[Tensor, "
     """Text tokens and mask without the columns that are padding in the whole batch."""
     longest = int(inputs.text_mask.sum(-1).max())
     return inputs.text[:, :longest], inputs.text_mask[:, :longest]
+
+
+def roughened(scene: Views, amplitude: float) -> Views:
+    """RVT's image noise: one amplitude a batch, up to `amplitude`, then uniform on every value.
+
+    Draws from torch's global generator, like dropout.
+    """
+    if amplitude == 0:
+        return scene
+    reach = amplitude * torch.rand(())
+    noise = reach * (2 * torch.rand_like(scene.views) - 1)
+    return Views((scene.views + noise).clamp(-1, 1))

@@ -1,28 +1,31 @@
-"""A trained network as a policy: observation -> virtual views -> network -> keyframe."""
+"""A trained network as a policy: observation -> its sight -> network -> keyframe."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
-from torch import Tensor
 
 from baselines import checkpoint as checkpoints
-from baselines.batch import Inputs, Prediction, proprio
+from baselines.batch import Prediction
 from baselines.checkpoint import Checkpoint
-from baselines.cloud import unproject
+from baselines.loader import inputs_of
+from baselines.sight import Moment
 from baselines.text import Tokens, pad
-from baselines.views import base_from_cube, cube_from_base, render_views
+from baselines.views import base_from_cube
 from sacil_tasks.interface import Keyframe, Observation
 
 
 @dataclass(frozen=True)
-class Instruction:
-    """The memory of an episode: its words, as the network reads them."""
+class Memory:
+    """What an episode has been so far, as far as the network wants to know."""
 
     tokens: Tokens
+    """The instruction as the network reads it."""
+
+    before: tuple[Observation, ...] = ()
+    """Earlier observations; none unless the network's sight remembers."""
 
 
 class KeyframePolicy:
@@ -33,43 +36,30 @@ class KeyframePolicy:
         self.checkpoint_sha256 = checkpoint.sha256
         self._network = checkpoint.network.eval()
         self._text = checkpoint.text
-        self._pixels: int = checkpoint.identity.config.pixels
-        self._device = next(checkpoint.network.parameters()).device
 
-    def begin(self, instruction: str) -> Instruction:
+    def begin(self, instruction: str) -> Memory:
         """Embed the words; sentences the checkpoint does not know need the text encoder.
 
         Raises:
             UsageError: the encoder is missing, another one, or the sentence is too long.
         """
-        return Instruction(self._text[instruction])
+        return Memory(self._text[instruction])
 
     @torch.inference_mode()
     def act(
-        self, observations: Sequence[Observation], memories: Sequence[Instruction]
-    ) -> tuple[list[Keyframe], list[Instruction]]:
+        self, observations: Sequence[Observation], memories: Sequence[Memory]
+    ) -> tuple[list[Keyframe], list[Memory]]:
         """Choose the next keyframe of each episode; no row depends on another."""
-        prediction = self._network.act(self._inputs(observations, memories))
-        return _keyframes(prediction), list(memories)
+        pairs = list(zip(observations, memories, strict=True))
+        moments = [Moment(seen, before=memory.before) for seen, memory in pairs]
+        words = pad([memory.tokens for memory in memories])
+        prediction = self._network.act(inputs_of(self._network.sight, moments, *words))
+        return _keyframes(prediction), [self._remembering(*pair) for pair in pairs]
 
-    def _inputs(
-        self, observations: Sequence[Observation], memories: Sequence[Instruction]
-    ) -> Inputs:
-        text, mask = pad([memory.tokens for memory in memories])
-        views = np.stack([_views(seen, self._pixels) for seen in observations])
-        state = [
-            proprio(gripper_open=o.gripper_open, step=o.step, max_steps=o.max_steps)
-            for o in observations
-        ]
-        return Inputs(
-            views=self._tensor(views),
-            proprio=self._tensor(np.array(state, np.float32)),
-            text=self._tensor(text),
-            text_mask=self._tensor(mask),
-        )
-
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self._device)
+    def _remembering(self, seen: Observation, memory: Memory) -> Memory:
+        if not self._network.sight.remembers:
+            return memory
+        return replace(memory, before=(*memory.before, seen))
 
 
 def load_policy(
@@ -83,12 +73,6 @@ def load_policy(
     name = f"{agent}:{variant}" if variant else agent
     folder = checkpoint or checkpoints.find_released(name, tasks)
     return KeyframePolicy(checkpoints.load(folder, agent=name, tasks=tasks))
-
-
-def _views(seen: Observation, pixels: int) -> Float32[np.ndarray, "5 7 h w"]:
-    """Virtual views of what the cameras see, without augmentation."""
-    cloud = unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
-    return render_views(cloud.xyz_in_base, cloud.rgb, cube_from_base(), pixels)
 
 
 def _keyframes(prediction: Prediction) -> list[Keyframe]:

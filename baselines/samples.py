@@ -18,7 +18,7 @@ from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
 from sacil_tasks.keyframes import NO_ROW, OBSERVATION_COLUMNS, Episode, KeyframeFile
 
-STREAMS = ("rows", "moves", "goals", "noise", "torch")
+STREAMS = ("rows", "moves", "goals", "points", "torch")
 """Random streams of a step: one more stream never changes what another draws."""
 
 
@@ -102,6 +102,11 @@ class Shard:
             step=int(c["step"][row]),
             max_steps=MAX_KEYFRAMES,
         )
+
+    def before(self, row: int) -> list[Observation]:
+        """The observations of the same episode before `row`."""
+        first = self.first_rows[int(self.columns["episode_id"][row])]
+        return [self.observation(earlier) for earlier in range(first, row)]
 
     def target_in_base(self, row: int) -> Float32[np.ndarray, "7"]:
         """Pose of the keyframe to be reached; at an episode's end the gripper's own pose."""

@@ -61,7 +61,8 @@ def _begin(material: Material) -> Run:
     material.text.save(folder / TEXT, sentences)
     data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
     plan = {"steps": steps, "request": _request(job), "keyframes": data}
-    run = Run(material.trainer(steps), folder, plan, validate=material.validator())
+    trainer = material.trainer(steps)
+    run = Run(trainer, folder, plan, validate=material.validator(trainer.network.sight))
     run.save()
     return run
 
@@ -77,7 +78,8 @@ def _continue(material: Material, state: TrainState) -> Run:
             )
     trainer = material.trainer(state.plan["steps"])
     folder = material.job.options.folder
-    run = Run(trainer, folder, state.plan, validate=material.validator())
+    validate = material.validator(trainer.network.sight)
+    run = Run(trainer, folder, state.plan, validate=validate)
     run.resume(state)
     return run
 

@@ -67,9 +67,13 @@ def main(config: ValidateConfig) -> None:
     keyframes = KeyframeSet.load(
         config.data / config.split / config.partition / "keyframes", config.tasks
     )
-    settings = trained.identity.config
     loader = Loader(
-        keyframes, trained.text, pixels=settings.pixels, recipe=settings.recipe, seed=0, goals=False
+        keyframes,
+        trained.text,
+        sight=trained.network.sight,
+        recipe=trained.identity.config.recipe,
+        seed=0,
+        goals=False,
     )
     for name, scores in validate(trained.network, loader).items():
         if "/" not in name:

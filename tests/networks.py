@@ -1,14 +1,23 @@
 """Random batches and tiny configs: what the tests of every network share."""
 
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
+from synthetic import observation
 from torch import Tensor
 
 from baselines.agent import Network
 from baselines.batch import Batch, Inputs, Labels
+from baselines.cloud import point_maps
+from baselines.loader import inputs_of
+from baselines.rotation import canonical_yaw, quaternion_to_bins
+from baselines.sight import Moment, Sight
 from baselines.text import TextSpec
+from baselines.views import cube_from_base
 
 TEXT = TextSpec(name="minilm", dim=16, max_tokens=8, fingerprint="0" * 64)
 
@@ -35,20 +44,26 @@ def tiny(config: Any) -> Any:
     return replace(config, **sizes, recipe=replace(config.recipe, precision="fp32"))
 
 
-def make_batch(pixels: int, *, size: int = 4, goals: bool = True, seed: int = 0) -> Batch:
-    """A random batch: two tasks with sizes by turns; sentences of 2 to 6 tokens."""
-    rng = torch.Generator().manual_seed(seed)
+def make_batch(sight: Sight, *, size: int = 4, goals: bool = True, seed: int = 0) -> Batch:
+    """A random batch: two tasks with sizes by turns; sentences of 2 to 6 tokens.
+
+    Where to go is red, the rest is grey noise.
+    """
+    rng = np.random.default_rng(seed)
     index = torch.arange(size)
     task, slot = index % 2, index // 2 % 3
+    moments, targets = zip(*(_painted(rng) for _ in index), strict=True)
+    turns = canonical_yaw(Rotation.random(size, rng).as_quat(scalar_first=True))
     return Batch(
-        inputs=make_inputs(pixels, size=size, seed=seed),
+        inputs=make_inputs(sight, size=size, seed=seed, moments=moments),
         labels=Labels(
-            position_in_cube=1.6 * torch.rand(size, 3, generator=rng) - 0.8,
-            rotation_bins=torch.randint(72, (size, 3), generator=rng),
-            gripper_open=torch.randint(2, (size,), generator=rng),
-            ignore_collisions=torch.randint(2, (size,), generator=rng),
+            position_in_cube=torch.tensor(np.stack(targets)),
+            quaternion_wxyz=torch.tensor(turns, dtype=torch.float32),
+            rotation_bins=torch.from_numpy(quaternion_to_bins(turns)),
+            gripper_open=torch.tensor(rng.integers(2, size=size)),
+            ignore_collisions=torch.tensor(rng.integers(2, size=size)),
         ),
-        goal_views=random_views(size, pixels, rng) if goals else None,
+        goal=sight.look(random_moments(size, seed + 1)) if goals else None,
         task=task,
         meaning=3 * task + slot,
         trajectory=index,
@@ -56,28 +71,48 @@ def make_batch(pixels: int, *, size: int = 4, goals: bool = True, seed: int = 0)
     )
 
 
-def make_inputs(pixels: int, *, size: int = 4, seed: int = 0) -> Inputs:
-    """Random views, words and proprioception."""
-    rng = torch.Generator().manual_seed(seed + 1)
-    lengths = 2 + torch.arange(size) % 5
-    mask = torch.arange(TEXT.max_tokens) < lengths[:, None]
-    words = torch.randn(size, TEXT.max_tokens, TEXT.dim, generator=rng)
-    return Inputs(
-        views=random_views(size, pixels, rng),
-        proprio=torch.rand(size, 2, generator=rng),
-        text=words * mask[..., None],
-        text_mask=mask,
-    )
+def make_inputs(
+    sight: Sight, *, size: int = 4, seed: int = 0, moments: Sequence[Moment] | None = None
+) -> Inputs:
+    """Random words for `moments`, by default random ones."""
+    rng = np.random.default_rng(seed + 2)
+    mask = np.arange(TEXT.max_tokens) < 2 + np.arange(size)[:, None] % 5
+    words = rng.normal(size=(size, TEXT.max_tokens, TEXT.dim)).astype(np.float32)
+    seen = moments or random_moments(size, seed)
+    return inputs_of(sight, seen, words * mask[..., None], mask)
 
 
-def random_views(size: int, pixels: int, rng: torch.Generator) -> Tensor:
-    """Noise in the shape of virtual views."""
-    return 2 * torch.rand(size, 5, 7, pixels, pixels, generator=rng) - 1
+def random_moments(size: int, seed: int = 0) -> list[Moment]:
+    """Observations of noise at different steps, each with a history."""
+    rng = np.random.default_rng(seed)
+    episode = [observation(rng, step) for step in range(4)]
+    return [Moment(episode[i % 4], before=episode[: i % 4], seed=i) for i in range(size)]
 
 
-def row(inputs: Inputs, index: int) -> Inputs:
-    """One sample of a batch, as a batch of one."""
-    return Inputs(**{name: value[index : index + 1] for name, value in vars(inputs).items()})
+def blank_moments(size: int, points: int = 0) -> list[Moment]:
+    """Observations that show nothing, or so many points."""
+    seen = observation(np.random.default_rng(0), 0)
+    depth_mm = np.zeros_like(seen.depth_mm)
+    depth_mm[0, 64, 64 : 64 + points] = 600
+    return [Moment(replace(seen, depth_mm=depth_mm)) for _ in range(size)]
+
+
+def _painted(rng: np.random.Generator) -> tuple[Moment, np.ndarray]:
+    """Grey noise with a red spot, and where in the cube the spot is."""
+    seen = observation(rng, int(rng.integers(3)))
+    row, column = rng.integers(32, 96, 2)
+    spot = slice(row - 4, row + 5), slice(column - 4, column + 5)
+    rgb, depth_mm = np.repeat(seen.rgb[..., :1] // 4, 3, -1), seen.depth_mm.copy()
+    rgb[:, *spot], depth_mm[:, *spot] = (255, 0, 0), rng.integers(550, 850)
+    maps, _ = point_maps(depth_mm, seen.intrinsics, seen.camera_in_base, cube_from_base())
+    return Moment(replace(seen, rgb=rgb, depth_mm=depth_mm)), maps[0, :, row, column]
+
+
+def row(part: Any, index: int) -> Any:
+    """One sample of a dataclass of tensors, as a batch of one."""
+    if is_dataclass(part):
+        return replace(part, **{name: row(value, index) for name, value in vars(part).items()})
+    return part[index : index + 1]
 
 
 def changed(inputs: Inputs, **values: Tensor) -> Inputs:

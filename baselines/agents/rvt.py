@@ -8,7 +8,7 @@ The preset `paper` is the published network (section 3 of that paper; 36,348,093
 512-wide text and four proprioceptive numbers); `cpu` keeps its steps at a size one core can train.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -25,10 +25,12 @@ from baselines.multiview import (
     ViewEncoder,
     blocks,
     positions,
+    roughened,
     trimmed_text,
     within_views,
 )
 from baselines.policy import KeyframePolicy, load_policy
+from baselines.sight import Views, ViewSight
 from baselines.text import TextSpec
 
 
@@ -91,6 +93,7 @@ class Rvt(Network):
         """Fresh weights; `text` says how wide a token vector is."""
         super().__init__()
         self.config = config
+        self.sight = ViewSight(config.pixels)
         joined = config.stem_channels + config.proprio_channels
         self.encoder = ViewEncoder(config)
         self.proprio = NormedLinear(config.proprio_width, config.proprio_channels)
@@ -101,9 +104,9 @@ class Rvt(Network):
         self.joint_blocks = blocks(config.joint_layers, config)
         self.action = ActionDecoder(config)
 
-    def forward(self, inputs: Inputs) -> ActionLogits:
+    def forward(self, inputs: Inputs[Views]) -> ActionLogits:
         """Logits of the next keyframe."""
-        tokens, skips = self.encoder(inputs.views)
+        tokens, skips = self.encoder(inputs.scene.views)
         proprio = self.proprio(inputs.proprio)[:, None].expand(-1, tokens.shape[1], -1)
         tokens = self.lift(torch.cat([tokens, proprio], dim=-1) + self.position)
         tokens = within_views(self.view_blocks, tokens)
@@ -122,7 +125,9 @@ class Rvt(Network):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning only."""
-        return action_loss(self(batch.inputs), batch.labels, self.config.recipe)
+        recipe = self.config.recipe
+        scene = roughened(batch.inputs.scene, recipe.image_noise)
+        return action_loss(self(replace(batch.inputs, scene=scene)), batch.labels, recipe)
 
     def act(self, inputs: Inputs) -> Prediction:
         """Highest point of the heatmaps, likeliest rotation, gripper and collision."""

@@ -33,10 +33,12 @@ from baselines.multiview import (
     blocks,
     last_token,
     positions,
+    roughened,
     trimmed_text,
     within_views,
 )
 from baselines.policy import KeyframePolicy, load_policy
+from baselines.sight import Views, ViewSight
 from baselines.stems import Maps
 from baselines.text import TextSpec
 from baselines.views import VIEWS
@@ -121,6 +123,7 @@ class Sacil(Network):
         """Fresh weights; `text` says how wide a token vector is."""
         super().__init__()
         self.config = config
+        self.sight = ViewSight(config.pixels)
         width = config.width
         self.encoder = ViewEncoder(config)
         self.position = positions(config, config.stem_channels)
@@ -139,9 +142,9 @@ class Sacil(Network):
             self.goal_position = positions(config, config.stem_channels)
             self.current_goal = Contrast(width, len(VIEWS) * width, width)
 
-    def forward(self, inputs: Inputs) -> Seen:
+    def forward(self, inputs: Inputs[Views]) -> Seen:
         """From views and words to the action's logits and the features to contrast."""
-        tokens, skips = self.visual_tokens(inputs.views, self.position)
+        tokens, skips = self.visual_tokens(inputs.scene, self.position)
         sentence = self.sentence(last_token(inputs))
         read = self._read(tokens, sentence)
         # Proprioception enters here and not before (D-proprio-late): the time step alone would
@@ -157,15 +160,15 @@ class Sacil(Network):
         )
 
     def visual_tokens(
-        self, views: Float[Tensor, "b v 7 h w"], position: Float[Tensor, "1 t c"]
+        self, scene: Views, position: Float[Tensor, "1 t c"]
     ) -> tuple[Float[Tensor, "b t d"], Maps]:
         """The visual encoder (section 3.3), and the stem's skips for the decoder."""
-        tokens, skips = self.encoder(views)
+        tokens, skips = self.encoder(scene.views)
         return within_views(self.view_blocks, self.lift(tokens + position)), skips
 
-    def goal_features(self, views: Float[Tensor, "b v 7 h w"]) -> Float[Tensor, "b vd"]:
+    def goal_features(self, goal: Views) -> Float[Tensor, "b vd"]:
         """Mean visual token of each view of the goal, one beside the other."""
-        tokens, _ = self.visual_tokens(views, self.goal_position)
+        tokens, _ = self.visual_tokens(goal, self.goal_position)
         return reduce(tokens, "b (v p) d -> b (v d)", "mean", v=len(VIEWS))
 
     def _read(self, tokens: Float[Tensor, "b t d"], sentence: Float[Tensor, "b d"]) -> Read:
@@ -189,15 +192,17 @@ class Sacil(Network):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning (Eq. 1) plus the contrasts that are switched on (Eq. 3 and 4)."""
-        seen = self(batch.inputs)
-        total, terms = action_loss(seen.logits, batch.labels, self.config.recipe)
+        recipe = self.config.recipe
+        scene = roughened(batch.inputs.scene, recipe.image_noise)
+        seen = self(replace(batch.inputs, scene=scene))
+        total, terms = action_loss(seen.logits, batch.labels, recipe)
         same = same_meaning(batch)
         if self.config.image_text_weight > 0:
             loss, cosines = self.image_text(seen.image, seen.sentence, same)
             total = total + self.config.image_text_weight * loss
             terms |= {"itc/loss": loss.detach(), **diagnostics("itc", cosines, batch)}
-        if batch.goal_views is not None and self.needs_goals:
-            goals = self.goal_features(batch.goal_views)
+        if batch.goal is not None and self.needs_goals:
+            goals = self.goal_features(roughened(batch.goal, recipe.image_noise))
             loss, cosines = self.current_goal(seen.situation, goals, same)
             total = total + self.config.current_goal_weight * loss
             terms |= {"cgc/loss": loss.detach(), **diagnostics("cgc", cosines, batch)}

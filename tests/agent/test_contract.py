@@ -6,13 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from networks import TEXT, make_batch, make_inputs, row, tiny
+from networks import TEXT, blank_moments, make_batch, make_inputs, row, tiny
 
 from baselines import checkpoint
 from baselines.agent import Network, agent_modules, find_agent
 from baselines.batch import Batch, Prediction
 from baselines.checkpoint import Identity
-from baselines.heatmap import target_heatmaps
 from baselines.optim import Lamb
 from baselines.text import SentenceTable
 
@@ -48,16 +47,8 @@ def network(name: str, config: Any) -> Network:
     return find_agent(name)[0].create(config, TEXT)
 
 
-def batch_for(network: Network, config: Any, **options: int) -> Batch:
-    return make_batch(config.pixels, goals=network.needs_goals, **options)
-
-
-def with_painted_target(batch: Batch) -> Batch:
-    """Views that show where to go as a red spot on grey noise."""
-    views = 0.1 * batch.inputs.views
-    spots = target_heatmaps(batch.labels.position_in_cube, views.shape[-1])
-    views[:, :, 3] += 10 * spots
-    return replace(batch, inputs=replace(batch.inputs, views=views))
+def batch_for(network: Network, **options: int) -> Batch:
+    return make_batch(network.sight, goals=network.needs_goals, **options)
 
 
 def assert_same(first: Prediction, second: Prediction, tolerance: float = 0.0) -> None:
@@ -69,8 +60,8 @@ def test_presets_are_what_the_command_line_offers(name: str) -> None:
     assert {"cpu", "paper"} <= set(find_agent(name)[0].presets)
 
 
-def test_one_batch_can_be_overfitted(network: Network, config: Any) -> None:
-    batch = with_painted_target(batch_for(network, config, size=2))
+def test_one_batch_can_be_overfitted(network: Network) -> None:
+    batch = batch_for(network, size=2)
     optimiser = Lamb(network, weight_decay=0.0)
     for step in range(100):
         loss, _ = network.loss(batch)
@@ -80,39 +71,39 @@ def test_one_batch_can_be_overfitted(network: Network, config: Any) -> None:
         found = network.eval().act(batch.inputs)
     labels = batch.labels
     distance = (found.position_in_cube - labels.position_in_cube).norm(dim=-1)
-    assert distance.max() < 4 / config.pixels
+    assert distance.max() < 0.15
     assert torch.equal(found.gripper_open, labels.gripper_open == 1)
     assert torch.equal(found.ignore_collisions, labels.ignore_collisions == 1)
 
 
-def test_the_loss_names_its_terms_as_detached_scalars(network: Network, config: Any) -> None:
-    loss, terms = network.loss(batch_for(network, config))
+def test_the_loss_names_its_terms_as_detached_scalars(network: Network) -> None:
+    loss, terms = network.loss(batch_for(network))
     assert loss.shape == ()
     assert loss.requires_grad
     assert terms
     assert all(term.shape == () and not term.requires_grad for term in terms.values())
 
 
-def test_every_parameter_is_taught(network: Network, config: Any) -> None:
-    network.loss(batch_for(network, config))[0].backward()
+def test_every_parameter_is_taught(network: Network) -> None:
+    network.loss(batch_for(network))[0].backward()
     untaught = [name for name, parameter in network.named_parameters() if parameter.grad is None]
     assert untaught == []
 
 
-def test_the_loss_is_finite_on_empty_views(network: Network, config: Any) -> None:
-    batch = batch_for(network, config)
-    empty = torch.zeros_like(batch.inputs.views)
-    empty[:, :, -1] = -1
-    goals = None if batch.goal_views is None else empty
-    batch = replace(batch, inputs=replace(batch.inputs, views=empty), goal_views=goals)
+@pytest.mark.parametrize("points", [0, 1])
+def test_the_loss_is_finite_where_there_is_nothing_to_see(network: Network, points: int) -> None:
+    batch = batch_for(network)
+    blank = network.sight.look(blank_moments(4, points))
+    goal = None if batch.goal is None else blank
+    batch = replace(batch, inputs=replace(batch.inputs, scene=blank), goal=goal)
     loss, _ = network.loss(batch)
     loss.backward()
     assert loss.isfinite()
     assert all(p.grad.isfinite().all() for p in network.parameters() if p.grad is not None)
 
 
-def test_a_batch_is_as_good_as_its_rows(network: Network, config: Any) -> None:
-    inputs = make_inputs(config.pixels)
+def test_a_batch_is_as_good_as_its_rows(network: Network) -> None:
+    inputs = make_inputs(network.sight)
     network.eval()
     with torch.no_grad():
         together = network.act(inputs)
@@ -122,16 +113,16 @@ def test_a_batch_is_as_good_as_its_rows(network: Network, config: Any) -> None:
             assert_same(expected, alone, tolerance=1e-5)
 
 
-def test_padding_of_the_text_changes_nothing(network: Network, config: Any) -> None:
-    inputs = make_inputs(config.pixels)
+def test_padding_of_the_text_changes_nothing(network: Network) -> None:
+    inputs = make_inputs(network.sight)
     noise = torch.where(inputs.text_mask[..., None], inputs.text, torch.tensor(7.0))
     network.eval()
     with torch.no_grad():
         assert_same(network.act(inputs), network.act(replace(inputs, text=noise)), tolerance=1e-5)
 
 
-def test_the_longest_instruction_is_read(network: Network, config: Any) -> None:
-    inputs = make_inputs(config.pixels, size=1)
+def test_the_longest_instruction_is_read(network: Network) -> None:
+    inputs = make_inputs(network.sight, size=1)
     long = replace(
         inputs,
         text=torch.randn(1, 77, TEXT.dim),
@@ -160,13 +151,13 @@ def test_a_checkpoint_round_trip_is_exact(
     )
     loaded = checkpoint.load(tmp_path, agent=name, tasks=("pick_and_lift",))
     assert asdict(loaded.identity.config) == asdict(config)
-    inputs = make_inputs(config.pixels)
+    inputs = make_inputs(network.sight)
     with torch.no_grad():
         assert_same(network.eval().act(inputs), loaded.network.act(inputs))
 
 
-def test_half_precision_training_stays_close(network: Network, config: Any) -> None:
-    batch = batch_for(network, config)
+def test_half_precision_training_stays_close(network: Network) -> None:
+    batch = batch_for(network)
     exact, _ = network.loss(batch)
     with torch.autocast("cpu", torch.bfloat16):
         rough, _ = network.loss(batch)

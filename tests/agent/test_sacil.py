@@ -8,9 +8,11 @@ import torch
 from networks import TEXT, changed, gradients, make_batch, make_inputs, tiny
 
 from baselines.optim import Lamb
+from baselines.sight import Views, ViewSight
 from sacil_agent.agents.sacil import CPU, PAPER, VARIANTS, Sacil
 
 CONFIG = tiny(CPU)
+SIGHT = ViewSight(CONFIG.pixels)
 
 
 @pytest.fixture
@@ -20,12 +22,12 @@ def network() -> Sacil:
 
 
 def other_words_and_hands(size: int = 4) -> dict[str, torch.Tensor]:
-    other = make_inputs(CONFIG.pixels, size=size, seed=9)
+    other = make_inputs(SIGHT, size=size, seed=9)
     return {"text": other.text, "text_mask": other.text_mask.flip(0), "proprio": other.proprio}
 
 
 def test_image_text_features_have_seen_neither_words_nor_proprioception(network: Sacil) -> None:
-    inputs = make_inputs(CONFIG.pixels)
+    inputs = make_inputs(SIGHT)
     with torch.no_grad():
         seen, other = network(inputs), network(changed(inputs, **other_words_and_hands()))
     assert torch.equal(seen.image, other.image)
@@ -35,7 +37,7 @@ def test_image_text_features_have_seen_neither_words_nor_proprioception(network:
 
 @pytest.mark.parametrize("field", ["text", "proprio"])
 def test_the_action_depends_on(network: Sacil, field: str) -> None:
-    inputs = make_inputs(CONFIG.pixels)
+    inputs = make_inputs(SIGHT)
     with torch.no_grad():
         seen = network(inputs)
         other = network(changed(inputs, **{field: getattr(inputs, field) + 1}))
@@ -45,7 +47,7 @@ def test_the_action_depends_on(network: Sacil, field: str) -> None:
 def test_the_papers_order_lets_the_words_into_image_text_features() -> None:
     torch.manual_seed(0)
     network = Sacil(VARIANTS["conditioned_contrast"](CONFIG), TEXT)
-    inputs = make_inputs(CONFIG.pixels)
+    inputs = make_inputs(SIGHT)
     with torch.no_grad():
         seen, other = network(inputs), network(changed(inputs, **other_words_and_hands()))
     assert not torch.equal(seen.image, other.image)
@@ -53,7 +55,7 @@ def test_the_papers_order_lets_the_words_into_image_text_features() -> None:
 
 def test_five_queries_stay_apart_after_a_step(network: Sacil) -> None:
     assert network.queries is not None
-    network.loss(make_batch(CONFIG.pixels))[0].backward()
+    network.loss(make_batch(SIGHT))[0].backward()
     Lamb(network, weight_decay=0.0).step(0.01)
     queries = network.queries.initial.detach()[0]
     assert len(queries) == 5
@@ -62,19 +64,19 @@ def test_five_queries_stay_apart_after_a_step(network: Sacil) -> None:
 
 
 def test_goals_change_the_goal_contrast_and_nothing_else(network: Sacil) -> None:
-    batch = make_batch(CONFIG.pixels)
-    assert batch.goal_views is not None
+    batch = make_batch(SIGHT)
+    assert batch.goal is not None
     _, terms = network.loss(batch)
-    _, other = network.loss(replace(batch, goal_views=batch.goal_views.flip(0)))
+    _, other = network.loss(replace(batch, goal=Views(batch.goal.views.flip(0))))
     differing = {name for name in terms if not torch.equal(terms[name], other[name])}
     assert "cgc/loss" in differing
     assert all(name.startswith("cgc/") for name in differing)
 
 
 def test_goal_gradients_reach_the_shared_encoder(network: Sacil) -> None:
-    views = make_batch(CONFIG.pixels).goal_views
-    assert views is not None
-    network.goal_features(views).square().sum().backward()
+    goal = make_batch(SIGHT).goal
+    assert goal is not None
+    network.goal_features(goal).square().sum().backward()
     reached = {name.partition(".")[0] for name in gradients(network)}
     assert reached == {"encoder", "goal_position", "lift", "view_blocks"}
 
@@ -93,15 +95,15 @@ def test_goal_gradients_reach_the_shared_encoder(network: Sacil) -> None:
 def test_variants_have_the_contrasts_they_name(variant: str | None, contrasts: set[str]) -> None:
     network = Sacil(VARIANTS[variant](CONFIG) if variant else CONFIG, TEXT)
     assert network.needs_goals is ("cgc" in contrasts)
-    _, terms = network.loss(make_batch(CONFIG.pixels, goals=network.needs_goals))
+    _, terms = network.loss(make_batch(SIGHT, goals=network.needs_goals))
     assert {name.partition("/")[0] for name in terms} == {"bc"} | contrasts
 
 
 def test_without_queries_the_mean_visual_token_is_contrasted() -> None:
     network = Sacil(VARIANTS["no_queries"](CONFIG), TEXT)
-    inputs = make_inputs(CONFIG.pixels)
+    inputs = make_inputs(SIGHT)
     with torch.no_grad():
-        tokens, _ = network.visual_tokens(inputs.views, network.position)
+        tokens, _ = network.visual_tokens(inputs.scene, network.position)
         assert torch.equal(network(inputs).image, tokens.mean(dim=1))
 
 

@@ -9,6 +9,7 @@ from torch import nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.sight import ViewSight
 from baselines.text import TextSpec, Tokens, text_spec
 from sacil_tasks.interface import SCENE_BOUNDS, Keyframe, Observation
 from sacil_tasks.keyframes import Episode, KeyframeDemo, KeyframeMeta, write_keyframes
@@ -110,18 +111,19 @@ class Tiny(Network):
 
     def __init__(self, config: TinyConfig, text: TextSpec) -> None:
         super().__init__()
+        self.sight = ViewSight(config.pixels)
         self.needs_goals = config.goals
         self.dropout = nn.Dropout(0.3)
         self.position = nn.Linear(5 * 7 + 2 + text.dim, 3)
 
     def forward(self, inputs: Inputs) -> torch.Tensor:
-        pooled = inputs.views.mean((-1, -2)).flatten(1)
+        pooled = inputs.scene.views.mean((-1, -2)).flatten(1)
         words = inputs.text.sum(1) / inputs.text_mask.sum(1, keepdim=True)
         return self.position(self.dropout(torch.cat([pooled, inputs.proprio, words], 1)))
 
     def loss(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         position = (self(batch.inputs) - batch.labels.position_in_cube).square().mean()
-        goal = position * 0 if batch.goal_views is None else batch.goal_views.mean()
+        goal = position * 0 if batch.goal is None else batch.goal.views.mean()
         terms = {"position": position, "goal": goal, "never": torch.tensor(torch.nan)}
         return position + 0 * goal, {name: term.detach() for name, term in terms.items()}
 

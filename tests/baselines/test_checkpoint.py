@@ -13,6 +13,7 @@ from baselines.batch import Inputs
 from baselines.checkpoint import CONFIG, MODEL, PROVENANCE, STATE, TEXT, Identity, TrainState
 from baselines.configs import restore
 from baselines.release import ReleaseConfig
+from baselines.sight import Views
 from baselines.text import SentenceTable, TextSpec
 from sacil_tasks.catalog import suite_tasks
 from sacil_tasks.errors import UsageError
@@ -53,7 +54,9 @@ def save_weights(path, identity):
 def inputs():
     generator = torch.Generator().manual_seed(0)
     return Inputs(
-        views=torch.rand(2, 5, 7, 16, 16, generator=generator),
+        scene=Views(torch.rand(2, 5, 7, 16, 16, generator=generator)),
+        gripper_in_cube=torch.zeros(2, 7),
+        step=torch.zeros(2, dtype=torch.int64),
         proprio=torch.rand(2, 2, generator=generator),
         text=torch.rand(2, 4, 8, generator=generator),
         text_mask=torch.ones(2, 4, dtype=torch.bool),

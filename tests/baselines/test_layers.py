@@ -11,6 +11,7 @@ from baselines.heads import ActionHead, ActionLogits, action_loss, choose, read_
 from baselines.heatmap import target_heatmaps
 from baselines.layers import BlockSizes, NormedLinear, SelfBlock, attend, padding_bias
 from baselines.rotation import bins_to_quaternion
+from baselines.sight import ViewSight
 from baselines.stems import (
     PatchDecoder,
     PatchStem,
@@ -129,7 +130,7 @@ def test_reading_at_the_heatmap_is_a_weighted_mean_without_gradient_to_the_heatm
 
 def labelled_logits(strength: float = 50.0) -> tuple[ActionLogits, torch.Tensor]:
     """Logits that say what the labels of a batch say."""
-    labels = make_batch(32).labels
+    labels = make_batch(ViewSight(32)).labels
     heat = (target_heatmaps(labels.position_in_cube, 32) + 1e-9).log()
     rotation = strength * functional.one_hot(labels.rotation_bins, 72).float()
     gripper = strength * functional.one_hot(labels.gripper_open, 2).float()
@@ -139,7 +140,7 @@ def labelled_logits(strength: float = 50.0) -> tuple[ActionLogits, torch.Tensor]
 
 def test_the_choice_is_what_the_logits_say() -> None:
     logits, position = labelled_logits()
-    labels, found = make_batch(32).labels, choose(logits)
+    labels, found = make_batch(ViewSight(32)).labels, choose(logits)
     assert (found.position_in_cube - position).abs().max() < 2 / 32
     assert torch.equal(found.quaternion_wxyz, bins_to_quaternion(labels.rotation_bins))
     assert torch.equal(found.gripper_open, labels.gripper_open == 1)
@@ -147,7 +148,7 @@ def test_the_choice_is_what_the_logits_say() -> None:
 
 
 def test_one_hot_labels_give_the_plain_sum_of_six_cross_entropies() -> None:
-    labels, size = make_batch(32).labels, 4
+    labels, size = make_batch(ViewSight(32)).labels, 4
     logits = ActionLogits(
         torch.randn(size, 5, 32, 32),
         torch.randn(size, 3, 72),
@@ -169,7 +170,7 @@ def test_one_hot_labels_give_the_plain_sum_of_six_cross_entropies() -> None:
 
 def test_terms_are_logged_without_their_weights() -> None:
     logits, _ = labelled_logits(strength=1.0)
-    labels = make_batch(32).labels
+    labels = make_batch(ViewSight(32)).labels
     light, terms = action_loss(logits, labels, Recipe(rotation_weight=1.0))
     heavy, same = action_loss(logits, labels, Recipe(rotation_weight=3.0))
     assert torch.equal(terms["bc/rotation"], same["bc/rotation"])

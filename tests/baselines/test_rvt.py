@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from networks import TEXT, changed, make_inputs, tiny
+from networks import TEXT, make_inputs, tiny
 
 from baselines.agents.rvt import CPU, PAPER, Rvt, RvtConfig
-from baselines.multiview import last_token, trimmed_text, within_views
+from baselines.multiview import last_token, roughened, trimmed_text, within_views
+from baselines.sight import Views, ViewSight
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
 
 CONFIG = tiny(CPU)
+SIGHT = ViewSight(CONFIG.pixels)
 
 
 @pytest.fixture
@@ -41,19 +43,26 @@ def test_view_layers_keep_views_apart(network: Rvt) -> None:
     assert torch.equal(before[:, 1:], after[:, 1:])
 
 
-@pytest.mark.parametrize("field", ["views", "text", "proprio"])
+@pytest.mark.parametrize("field", ["scene", "text", "proprio"])
 def test_every_view_hears_of_a_change_in(network: Rvt, field: str) -> None:
-    inputs = make_inputs(CONFIG.pixels, size=1)
-    value = getattr(inputs, field).clone()
-    value[:, 0] += 1
+    inputs = make_inputs(SIGHT, size=1)
+    value = getattr(inputs, field)
+    other = Views(value.views.flip(1)) if field == "scene" else value + 1
     with torch.no_grad():
         before = network(inputs).heatmaps
-        after = network(changed(inputs, **{field: value})).heatmaps
+        after = network(replace(inputs, **{field: other})).heatmaps
     assert ((before - after).abs().amax(dim=(-1, -2)) > 0).all()
 
 
+def test_image_noise_is_bounded_and_spares_the_original() -> None:
+    scene = make_inputs(SIGHT).scene
+    assert roughened(scene, 0.0) is scene
+    noise = roughened(scene, 0.1).views - scene.views.clamp(-1, 1)
+    assert 0 < noise.abs().max() <= 0.1 + 1e-6
+
+
 def test_text_is_trimmed_to_the_longest_sentence() -> None:
-    inputs = make_inputs(CONFIG.pixels)
+    inputs = make_inputs(SIGHT)
     text, mask = trimmed_text(inputs)
     assert text.shape[1] == mask.shape[1] == int(inputs.text_mask.sum(1).max())
     assert torch.equal(last_token(inputs)[2], inputs.text[2, int(inputs.text_mask[2].sum()) - 1])

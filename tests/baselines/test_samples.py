@@ -8,16 +8,16 @@ import synthetic
 import torch
 
 from baselines.agent import Recipe
-from baselines.augment import Augmentation, AugmentConfig
+from baselines.augment import AugmentConfig
 from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet, Sample, Shard, stream
+from baselines.sight import Moment, ViewSight
 from baselines.text import SentenceTable, TextSpec, tidy
 from baselines.views import base_from_cube
 from sacil_tasks.errors import UsageError
 
 TASKS = ("pick_and_lift", "pick_up_cup")
-NO_MOVE = Augmentation(0.0, np.zeros(3))
 STILL = AugmentConfig(yaw_rad=0.0, translation_m=0.0)
 
 
@@ -33,7 +33,7 @@ def loader(keyframes, *, seed=0, goals=False, **recipe):
     return Loader(
         keyframes,
         SentenceTable(TextSpec("fake", 8, 32, "0"), table),
-        pixels=16,
+        sight=ViewSight(16),
         recipe=Recipe(batch=6, **recipe),
         seed=seed,
         goals=goals,
@@ -42,9 +42,9 @@ def loader(keyframes, *, seed=0, goals=False, **recipe):
 
 def tensors(batch):
     """All tensors of a batch but its goals, by name."""
-    parts = [batch.inputs, batch.labels, batch]
+    parts = [batch.inputs.scene, batch.inputs, batch.labels, batch]
     named = {f.name: getattr(part, f.name) for part in parts for f in fields(part)}
-    return {n: t for n, t in named.items() if isinstance(t, torch.Tensor) and n != "goal_views"}
+    return {n: t for n, t in named.items() if isinstance(t, torch.Tensor)}
 
 
 def assert_same(first, second):
@@ -53,22 +53,19 @@ def assert_same(first, second):
 
 def test_a_batch_is_a_function_of_seed_and_step(keyframes):
     assert_same(loader(keyframes, seed=3).batch(7), loader(keyframes, seed=3).batch(7))
-    views = [loader(keyframes, seed=s).batch(n).inputs.views for s, n in ((3, 7), (3, 8), (4, 7))]
+    views = [
+        loader(keyframes, seed=s).batch(n).inputs.scene.views for s, n in ((3, 7), (3, 8), (4, 7))
+    ]
     assert not torch.equal(views[0], views[1])
     assert not torch.equal(views[0], views[2])
 
 
-def test_goals_and_noise_do_not_change_what_behaviour_cloning_sees(keyframes):
+def test_goals_do_not_change_what_behaviour_cloning_sees(keyframes):
     plain, with_goals = loader(keyframes), loader(keyframes, goals=True)
-    noisy = loader(keyframes, image_noise=0.1)
     for step in range(5):
         expected = plain.batch(step)
-        assert expected.goal_views is None
+        assert expected.goal is None
         assert_same(expected, with_goals.batch(step))
-        blurred = noisy.batch(step)
-        assert torch.equal(expected.labels.position_in_cube, blurred.labels.position_in_cube)
-        noise = blurred.inputs.views - expected.inputs.views.clamp(-1, 1)
-        assert 0 < noise.abs().max() <= 0.1 + 1e-6
 
 
 def test_every_batch_tells_two_sizes_of_one_task_apart(keyframes):
@@ -126,14 +123,13 @@ def test_goal_is_the_next_observation(keyframes):
     batch = loader(keyframes, goals=True, augment=STILL).batch(0)
     drawn = keyframes.draw(stream(0, 0, "rows"), 6, Recipe().choice_share)
     after = [Sample(s.shard, s.row + 1) for s in drawn]
-    # Of an observation that leads nowhere `plain` has no label, but it has views.
-    views = loader(keyframes).views(after, lambda _: NO_MOVE)[0]
-    assert torch.equal(batch.goal_views, views)
+    moments = [Moment(keyframes.shards[s.shard].observation(s.row)) for s in after]
+    assert torch.equal(batch.goal.views, ViewSight(16).look(moments).views)
 
 
 def test_goals_are_moved_by_their_own_draw(keyframes):
     fixed, moved = (loader(keyframes, goals=True, **r) for r in ({"augment": STILL}, {}))
-    assert not torch.equal(fixed.batch(0).goal_views, moved.batch(0).goal_views)
+    assert not torch.equal(fixed.batch(0).goal.views, moved.batch(0).goal.views)
 
 
 def test_labels_without_augmentation_are_the_commanded_keyframes(keyframes):
@@ -159,7 +155,7 @@ def test_label_and_cloud_move_together(keyframes):
     columns["keyframe_in_base"][:, :3] = (seen.camera_in_base[0] @ [*ray, 1])[:3]
     scene = KeyframeSet([replace(keyframes.shards[0], columns=columns)])
     batch = loader(scene).batch(0)
-    for views, label in zip(batch.inputs.views, batch.labels.position_in_cube, strict=True):
+    for views, label in zip(batch.inputs.scene.views, batch.labels.position_in_cube, strict=True):
         xyz = views[:, :3].permute(0, 2, 3, 1)[views[:, 3:6].sum(1) > 0]
         assert len(xyz) > 0
         torch.testing.assert_close(xyz, label.expand_as(xyz), atol=2e-3, rtol=0)

@@ -8,6 +8,7 @@ from baselines.batch import Prediction
 from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet
+from baselines.sight import ViewSight
 from baselines.text import SentenceTable, TextSpec, tidy
 from baselines.validate import grip_angle_deg, validate
 from baselines.views import cube_from_base
@@ -19,7 +20,7 @@ def loader(data):
     keyframes = KeyframeSet.load(data / "canon/val/keyframes", ["pick_and_lift"])
     sentences = {tidy(e.instruction) for e in keyframes.shards[0].episodes}
     text = SentenceTable(TextSpec("fake", 4, 32, "0"), dict.fromkeys(sentences, np.ones((2, 4))))
-    return Loader(keyframes, text, pixels=16, recipe=Recipe(), seed=0, goals=False)
+    return Loader(keyframes, text, sight=ViewSight(16), recipe=Recipe(), seed=0, goals=False)
 
 
 class Cheat(Network):
@@ -33,8 +34,8 @@ class Cheat(Network):
         self.seen = 0
 
     def act(self, inputs):
-        rows = slice(self.seen, self.seen + len(inputs.views))
-        self.seen += len(inputs.views)
+        rows = slice(self.seen, self.seen + len(inputs.scene.views))
+        self.seen += len(inputs.scene.views)
         return Prediction(
             self.labels.position_in_cube[rows] + self.shift,
             bins_to_quaternion(self.labels.rotation_bins[rows]),

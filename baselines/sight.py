@@ -1,0 +1,156 @@
+"""From what the cameras saw to the tensors a network reads.
+
+A network names its `Sight`. Training and acting look through the same one, so that what a network
+was trained on is what it gets.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from baselines.augment import Augmentation
+from baselines.cloud import point_maps, unproject
+from baselines.views import CHANNELS, VIEWS, apply_affine, cube_from_base, render_views
+from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, Observation
+
+STILL = Augmentation(0.0, np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Moment:
+    """An observation, and how it is to be shown."""
+
+    seen: Observation
+
+    move: Augmentation = STILL
+    """How the scene is moved before it is looked at."""
+
+    before: Sequence[Observation] = ()
+    """Earlier observations of the episode, the first one first; empty unless they are wanted."""
+
+    seed: int = 0
+    """For random choices, among points for example: drawn anew in training, 0 when acting."""
+
+    @property
+    def gripper_in_cube(self) -> Float32[np.ndarray, "7"]:
+        """Gripper pose after the move: position in the cube, quaternion wxyz."""
+        return gripper_in_cube(self.seen, self.move)
+
+
+class Sight(Protocol):
+    """What a network reads of a scene; `look` gives a dataclass of tensors, samples first."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether earlier observations are wanted."""
+
+    def look(self, moments: Sequence[Moment]) -> Any:
+        """All moments as one batch; no row depends on another."""
+
+
+def gripper_in_cube(seen: Observation, move: Augmentation) -> Float32[np.ndarray, "7"]:
+    """Gripper pose of an observation: position in the cube, quaternion wxyz."""
+    pose = move.move_pose(seen.tcp_in_base.astype(np.float64))
+    position = apply_affine(cube_from_base(), pose[:3])
+    return np.concatenate([position, pose[3:]]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Virtual views of the merged cloud."""
+
+    views: Float[Tensor, "b v 7 h w"]
+    """xyz (cube), rgb ([0, 1]), depth; see `baselines.views`."""
+
+
+class ViewSight:
+    """Draws the five virtual views."""
+
+    remembers = False
+
+    def __init__(self, pixels: int) -> None:
+        """Views of `pixels` a side."""
+        self.pixels = pixels
+
+    def look(self, moments: Sequence[Moment]) -> Views:
+        """Unproject, move and draw each scene."""
+        shape = (len(VIEWS), len(CHANNELS), self.pixels, self.pixels)
+        views = np.empty((len(moments), *shape), np.float32)
+        for moment, out in zip(moments, views, strict=True):
+            seen = moment.seen
+            cloud = unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
+            render_views(cloud.xyz_in_base, cloud.rgb, moment.move.to_cube(), self.pixels, out)
+        return Views(torch.from_numpy(views))
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What the cameras saw, with the place of every pixel: now, and before if that is wanted.
+
+    The present comes last; shorter histories begin with steps that did not happen.
+    """
+
+    rgb: UInt8[Tensor, "b t k 3 h w"]
+
+    xyz_in_cube: Float[Tensor, "b t k 3 h w"]
+    """Where each pixel's point is; 0 where nothing was seen."""
+
+    seen: Bool[Tensor, "b t k h w"]
+    """Whether the pixel shows a point inside the cube."""
+
+    gripper_in_cube: Float[Tensor, "b t 7"]
+    """Position in the cube, quaternion wxyz."""
+
+    happened: Bool[Tensor, "b t"]
+    """False at steps that only pad."""
+
+    step: Float[Tensor, "b t"]
+    """Keyframes executed before."""
+
+
+class CameraSight:
+    """Keeps the camera images as they are; moves only their points."""
+
+    def __init__(self, *, remembers: bool, steps: int = 1) -> None:
+        """Show the last `steps` observations, the present one included."""
+        self.remembers = remembers
+        self.steps = steps
+
+    def look(self, moments: Sequence[Moment]) -> Pictures:
+        """Images and point maps, as long a history as the longest in the batch."""
+        shown = [[*moment.before, moment.seen][-self.steps :] for moment in moments]
+        longest = max(len(observations) for observations in shown)
+        pictures = _blank(len(moments), longest)
+        for row, (moment, observations) in enumerate(zip(moments, shown, strict=True)):
+            for t, seen in enumerate(observations, start=longest - len(observations)):
+                _fill(pictures, row, t, seen, moment.move)
+        return pictures
+
+
+def _blank(rows: int, steps: int) -> Pictures:
+    images = (rows, steps, len(CAMERAS), 3, IMAGE_PIXELS, IMAGE_PIXELS)
+    return Pictures(
+        rgb=torch.zeros(images, dtype=torch.uint8),
+        xyz_in_cube=torch.zeros(images),
+        seen=torch.zeros((*images[:3], *images[4:]), dtype=torch.bool),
+        gripper_in_cube=torch.zeros((rows, steps, 7)),
+        happened=torch.zeros((rows, steps), dtype=torch.bool),
+        step=torch.zeros((rows, steps)),
+    )
+
+
+def _fill(pictures: Pictures, row: int, t: int, seen: Observation, move: Augmentation) -> None:
+    xyz_in_cube, inside = point_maps(
+        seen.depth_mm, seen.intrinsics, seen.camera_in_base, move.to_cube()
+    )
+    pictures.rgb[row, t] = torch.from_numpy(seen.rgb).permute(0, 3, 1, 2)
+    pictures.xyz_in_cube[row, t] = torch.from_numpy(xyz_in_cube)
+    pictures.seen[row, t] = torch.from_numpy(inside)
+    pictures.gripper_in_cube[row, t] = torch.from_numpy(gripper_in_cube(seen, move))
+    pictures.happened[row, t] = True
+    pictures.step[row, t] = seen.step

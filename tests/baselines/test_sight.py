@@ -1,0 +1,65 @@
+"""What networks read of a scene: every pixel in its place, and the past in its order."""
+
+import numpy as np
+import pytest
+import torch
+from synthetic import observation
+
+from baselines.augment import Augmentation
+from baselines.cloud import point_maps, unproject
+from baselines.sight import CameraSight, Moment, ViewSight
+from baselines.views import apply_affine, cube_from_base
+
+MOVE = Augmentation(0.6, np.array([0.05, -0.03, 0.02]))
+
+
+@pytest.fixture(scope="module")
+def episode():
+    rng = np.random.default_rng(3)
+    return [observation(rng, step) for step in range(5)]
+
+
+def test_point_maps_hold_the_points_of_the_cloud(episode):
+    seen = episode[0]
+    cloud = unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
+    maps, inside = point_maps(seen.depth_mm, seen.intrinsics, seen.camera_in_base, MOVE.to_cube())
+    expected = apply_affine(MOVE.to_cube(), cloud.xyz_in_base)
+    found = maps.transpose(0, 2, 3, 1)[seen.depth_mm > 0]
+    within = (np.abs(expected) <= 1).all(-1)
+    assert np.array_equal(inside[seen.depth_mm > 0], within)
+    assert not inside[seen.depth_mm == 0].any()
+    np.testing.assert_allclose(found[within], expected[within], atol=1e-6)
+    assert (found[~within] == 0).all()
+
+
+def test_the_present_comes_last_and_shorter_histories_are_padded_before(episode):
+    moments = [Moment(episode[2], before=episode[:2]), Moment(episode[0])]
+    pictures = CameraSight(remembers=True, steps=4).look(moments)
+    assert pictures.happened.tolist() == [[True, True, True], [False, False, True]]
+    assert pictures.step[0].tolist() == [0, 1, 2]
+    for t in range(3):
+        expected = torch.from_numpy(episode[t].rgb).permute(0, 3, 1, 2)
+        assert torch.equal(pictures.rgb[0, t], expected)
+    assert not pictures.seen[1, :2].any()
+
+
+def test_only_as_many_steps_as_asked_for_are_shown(episode):
+    pictures = CameraSight(remembers=True, steps=2).look([Moment(episode[4], before=episode[:4])])
+    assert pictures.step.tolist() == [[3, 4]]
+
+
+@pytest.mark.parametrize("sight", [ViewSight(16), CameraSight(remembers=False)])
+def test_rows_do_not_depend_on_each_other(episode, sight):
+    moments = [Moment(seen, MOVE) for seen in episode[:3]]
+    together = sight.look(moments)
+    for index, moment in enumerate(moments):
+        alone = sight.look([moment])
+        for name, value in vars(alone).items():
+            assert torch.equal(value, getattr(together, name)[index : index + 1])
+
+
+def test_the_gripper_moves_with_the_scene(episode):
+    pose = Moment(episode[0], MOVE).gripper_in_cube
+    moved = MOVE.move_pose(episode[0].tcp_in_base.astype(float))
+    np.testing.assert_allclose(pose[:3], apply_affine(cube_from_base(), moved[:3]), atol=1e-6)
+    np.testing.assert_allclose(pose[3:], moved[3:], atol=1e-6)
