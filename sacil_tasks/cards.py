@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from jaxtyping import Float64
 
 from sacil_tasks.catalog import MAX_EPISODE_STEPS, env_id, task_docstrings, task_names, task_spec
 from sacil_tasks.errors import run_command
@@ -187,7 +188,7 @@ def _sizes(spec: TaskSpec, name: str) -> str:
     return _SHOWN[split.objects] + " or ".join(triples)
 
 
-def _nominal_m(family: str, split: Split) -> list[np.ndarray]:
+def _nominal_m(family: str, split: Split) -> list[Float64[np.ndarray, "3"]]:
     """What the candidates of a split measure but for the jitter, small to large."""
     labels, unjittered = np.arange(CANDIDATES), np.ones(CANDIDATES)
     if split.ratio is not None:
