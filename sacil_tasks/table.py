@@ -19,7 +19,16 @@ from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, instructions, props, scenes, simulation, sizes, wording
+from sacil_tasks import (
+    cameras,
+    instructions,
+    props,
+    robot_looks,
+    scenes,
+    simulation,
+    sizes,
+    wording,
+)
 from sacil_tasks.contacts import ContactLog
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
@@ -264,6 +273,8 @@ class SizedTableEnv(BaseEnv):
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE_IN_WORLD_M))
+        if self.scene.can_render():
+            robot_looks.lighten(self.agent.robot)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")
