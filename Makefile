@@ -24,9 +24,9 @@ test: setup ## style, types and all tests
 	@$(PYTHON) -m mypy
 	@$(PYTHON) -m pytest --numprocesses $(WORKERS) --dist loadfile
 
-demos: setup ## 100 expert demonstrations a task, and 36 for validation, into data/
-	@$(PYTHON) -m sacil_tasks.gen_demos --suite slice --demos 100 --workers $(WORKERS)
-	@$(PYTHON) -m sacil_tasks.gen_demos --suite slice --demos 36 --partition val --workers $(WORKERS)
+demos: setup ## 100 expert demonstrations of each of the nine tasks, and 36 for validation, into data/
+	@$(PYTHON) -m sacil_tasks.gen_demos --suite all --demos 100 --workers $(WORKERS)
+	@$(PYTHON) -m sacil_tasks.gen_demos --suite all --demos 36 --partition val --workers $(WORKERS)
 
 train: setup ## train AGENT (sacil) on data/, cpu preset
 	@$(PYTHON) -m baselines.train --agent $(AGENT) --suite slice

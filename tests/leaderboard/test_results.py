@@ -65,14 +65,14 @@ def test_readme_has_the_table():
 
 
 def table() -> Iterator[str]:
-    """Rows of README's table: strict success, interval and count of each agent."""
+    """Rows of README's table: strict success, interval and count of each agent that played."""
     cells = {}
     for agent in AGENTS:
         with (RESULTS / "test" / agent / "summary.csv").open() as file:
             for row in csv.DictReader(file):
                 cells[row["task"], row["split"], agent] = cell(row)
     for task, split in dict.fromkeys(key[:2] for key in cells):
-        shown = " | ".join(cells[task, split, agent] for agent in AGENTS)
+        shown = " | ".join(cells.get((task, split, agent), "") for agent in AGENTS)
         yield f"| {task} | {split} | {shown} |"
 
 
