@@ -1,22 +1,25 @@
 """What the robot looks like: ManiSkill's Panda with a tenth of its triangles.
 
 Its meshes have 136,000 of them, which software rendering spends 85 % of its time on; at the
-cameras' 128 pixels most of them are smaller than a tenth of a pixel. Triangles are merged by
-clustering their corners in a grid. Collision shapes stay as they are. D-looks.
+cameras' 128 pixels most of them are smaller than a tenth of a pixel. Collision shapes stay as they
+are. D-looks.
 """
 
 from functools import cache
 
 import numpy as np
 import sapien
-from jaxtyping import Float32, Int64, UInt32
+import trimesh
 from mani_skill.utils.structs import Articulation
 
-CELLS_M = {"panda_hand": 0.004, "panda_leftfinger": 0.0, "panda_rightfinger": 0.0}
-"""Grid of the links that the wrist camera sees from close by; 0 leaves a link as it is."""
+SHARE = 0.1
+"""Of a part's triangles that are kept."""
 
-CELL_M = 0.010
-"""Grid of the others: a pixel of the fixed cameras shows 7 mm."""
+FEW = 600
+"""Parts with fewer triangles stay as they are."""
+
+CREASE_RAD = 0.5
+"""Faces that meet at a larger angle are shaded apart."""
 
 
 def lighten(robot: Articulation) -> None:
@@ -25,18 +28,15 @@ def lighten(robot: Articulation) -> None:
     Call it before the scene is rendered for the first time.
     """
     for link in robot.links:
-        cell_m = CELLS_M.get(link.name, CELL_M)
         for component in link._objs:  # noqa: SLF001 -- no public way to the parallel ones
             body = component.entity.find_component_by_type(sapien.render.RenderBodyComponent)
-            if body is not None and cell_m:
-                _exchange(component.entity, body, link.name, cell_m)
+            if body is not None:
+                _exchange(component.entity, body, link.name)
 
 
-def _exchange(
-    entity: sapien.Entity, body: sapien.render.RenderBodyComponent, name: str, cell_m: float
-) -> None:
+def _exchange(entity: sapien.Entity, body: sapien.render.RenderBodyComponent, name: str) -> None:
     if name not in _known():
-        _known()[name] = _light_shapes(body, cell_m)
+        _known()[name] = _light_shapes(body)
     lighter = sapien.render.RenderBodyComponent()
     for shape in _known()[name]:
         lighter.attach(shape.clone())
@@ -51,59 +51,28 @@ def _known() -> dict[str, list[sapien.render.RenderShapeTriangleMesh]]:
 
 
 def _light_shapes(
-    body: sapien.render.RenderBodyComponent, cell_m: float
+    body: sapien.render.RenderBodyComponent,
 ) -> list[sapien.render.RenderShapeTriangleMesh]:
-    """One shape for each part of a link that is larger than a grid cell."""
+    """One shape for each part of a link, in the part's material."""
     shapes = []
     for shape in body.render_shapes:
         for part in shape.parts:
-            vertices_m, triangles = merged(
-                np.asarray(part.vertices) * np.asarray(shape.scale),
-                np.asarray(part.triangles),
-                cell_m,
+            mesh = simplified(trimesh.Trimesh(part.vertices * shape.scale, part.triangles))
+            lighter = sapien.render.RenderShapeTriangleMesh(
+                mesh.vertices.astype(np.float32),
+                mesh.faces.astype(np.uint32),
+                mesh.vertex_normals.astype(np.float32),
+                np.zeros((len(mesh.vertices), 2), np.float32),
+                part.material,
             )
-            if len(triangles):
-                lighter = sapien.render.RenderShapeTriangleMesh(
-                    vertices_m,
-                    triangles,
-                    _normals(vertices_m, triangles),
-                    np.zeros((len(vertices_m), 2), np.float32),
-                    part.material,
-                )
-                lighter.local_pose = shape.local_pose
-                shapes.append(lighter)
+            lighter.local_pose = shape.local_pose
+            shapes.append(lighter)
     return shapes
 
 
-def merged(
-    vertices_m: Float32[np.ndarray, "v 3"], triangles: UInt32[np.ndarray, "t 3"], cell_m: float
-) -> tuple[Float32[np.ndarray, "w 3"], UInt32[np.ndarray, "u 3"]]:
-    """The mesh with all vertices of a grid cell moved into their mean; flat triangles are left out.
-
-    Vertex clustering (Rossignac and Borrel, 1993).
-    """
-    _, cell = np.unique(_cells(vertices_m, cell_m), return_inverse=True)
-    counts = np.bincount(cell)
-    means_m = np.stack([np.bincount(cell, axis) / counts for axis in vertices_m.T], axis=1)
-    corners = cell[triangles]
-    proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    _, first = np.unique(np.sort(corners[proper], axis=1), axis=0, return_index=True)
-    kept = corners[proper][np.sort(first)]
-    return means_m.astype(np.float32), kept.astype(np.uint32)
-
-
-def _cells(vertices_m: Float32[np.ndarray, "v 3"], cell_m: float) -> Int64[np.ndarray, "v"]:
-    """The number of the grid cell that each vertex is in."""
-    steps = np.floor((vertices_m - vertices_m.min(axis=0)) / cell_m).astype(np.int64)
-    return np.ravel_multi_index(tuple(steps.T), steps.max(axis=0) + 1)
-
-
-def _normals(
-    vertices_m: Float32[np.ndarray, "v 3"], triangles: UInt32[np.ndarray, "t 3"]
-) -> Float32[np.ndarray, "v 3"]:
-    """Mean normal of the triangles around each vertex, weighted by their area."""
-    a, b, c = (vertices_m[corner] for corner in triangles.T)
-    normals = np.zeros_like(vertices_m)
-    for corner in triangles.T:
-        np.add.at(normals, corner, np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+def simplified(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with a tenth of its triangles (quadric edge collapse), smooth between creases."""
+    count = max(FEW, round(SHARE * len(mesh.faces)))
+    if count < len(mesh.faces):
+        mesh = mesh.simplify_quadric_decimation(face_count=count)
+    return trimesh.graph.smooth_shade(mesh, angle=CREASE_RAD)
