@@ -18,7 +18,8 @@ def test_a_ball_stays_a_ball_with_a_tenth_of_its_triangles() -> None:
     assert np.linalg.norm(lighter.vertices, axis=1) == pytest.approx(0.1, abs=0.001)
     assert lighter.volume == pytest.approx(ball.volume, rel=0.02)
     outwards = (lighter.vertex_normals * lighter.vertices).sum(axis=1) / 0.1
-    assert outwards.min() > 0.95, "a smooth surface is shaded smoothly"
+    assert np.median(outwards) > 0.99, "a smooth surface is shaded smoothly"
+    assert outwards.min() > 0.7
 
 
 def test_edges_of_a_box_stay_sharp() -> None:
