@@ -116,10 +116,8 @@ def _shown(course: Course) -> int:
 
 def _row(course: Course, columns: int) -> Image:
     count = _shown(course)
-    tiles = [
-        _framed(_resized(course.start), "start", GREY),
-        *(tile(course, k) for k in range(count)),
-    ]
+    start = _framed(_resized(course.start), "start", GREY)
+    tiles = [start, *(tile(course, k) for k in range(count))]
     tiles += [np.full_like(tiles[0], 255)] * (columns - len(tiles))
     hidden = len(course.steps) - count
     title = course.title + (f" ({hidden} more keyframes not shown)" if hidden else "")
