@@ -18,7 +18,7 @@ from leaderboard.agents import find_agent
 from leaderboard.plan import words_per_scene
 from leaderboard.protocol import protocol_name
 from leaderboard.records import EpisodeKey
-from leaderboard.retrace import Case, Traced, Tracer
+from leaderboard.retrace import Case, Traced
 from leaderboard.strip import Course, Image, draw
 from leaderboard.worker import Choice
 from sacil_tasks.catalog import task_spec
@@ -141,7 +141,7 @@ def _play(cases: Sequence[Case], workers: int) -> list[Traced]:
         UsageError: an agent cannot be loaded, or its process died.
     """
     found = {}
-    for case, result in run_jobs(cases, Tracer(), min(workers, len(cases))):
+    for case, result in run_jobs(cases, "leaderboard.retrace:tracer", min(workers, len(cases))):
         if isinstance(result, JobFailure):
             raise UsageError(
                 f"{case.choice.agent.name} failed ({result.reason}).\n{result.details}".rstrip()

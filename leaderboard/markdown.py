@@ -24,7 +24,8 @@ _ON_DIFFERENCES = (
     "Differences are paired over the scenes that both agents met. Interval: bootstrap over "
     "training seeds, then scenes within tasks; with one seed each it says nothing of another "
     "training. p: sign-flip test on scenes, beside it adjusted (Holm) for the rows of this table. "
-    "Detectable: the smallest true difference that would be found in 80 % of such experiments."
+    "Detectable: the smallest true difference that would be found in 80 % of such experiments, at "
+    "5 % over all rows."
 )
 
 

@@ -120,15 +120,14 @@ def build_panel(
     """
     mine = [score for score in scores if score.task in SUITES[suite]]
     rows = (*layout.rows, *(_others(layout, mine) if layout.open_to_others else ()))
-    contenders = [row.agent for row in layout.rows if row.block != PROBE]
-    trained = [
-        score
-        for score in mine
-        if score.agent in contenders
-        and score.agent != EQUAL_COMPUTE
-        and score.protocol == protocols[score.task]
-    ]
-    terms = _choose_terms(layout, suite, trained, against, samples)
+    blocks = {row.agent: row.block for row in rows if row.agent != EQUAL_COMPUTE}
+    current = [it for it in mine if it.protocol == protocols[it.task] and it.agent in blocks]
+    groups = (
+        [score for score in current if score.agent == against],
+        [score for score in current if blocks[score.agent] != OTHER],
+        current,
+    )
+    terms = _choose_terms(layout.name, set(SUITES[suite]), groups, samples)
     entrants = {row.agent: _entrant(row, mine, terms, protocols) for row in rows}
     most = {
         task: max(len(score.records) for e in entrants.values() for score in e.scores.get(task, ()))
@@ -146,28 +145,28 @@ def _others(layout: Layout, scores: Iterable[Score]) -> tuple[Row, ...]:
 
 
 def _choose_terms(
-    layout: Layout, suite: str, scores: Sequence[Score], against: str, samples: int | None
+    table: str, tasks: set[str], groups: Iterable[Sequence[Score]], samples: int | None
 ) -> Terms | None:
-    """Those of the agent compared with, else those that all have; of networks trained on just
-    these tasks, if there are any.
+    """Those of the first group of scores that has any; of networks trained on just `tasks`, if
+    there are some. None without a trained network.
 
     Raises:
         UsageError: there are several.
     """
-    for group in ([score for score in scores if score.agent == against], scores):
+    for group in groups:
         found = {
             score.training.terms: score
             for score in group
             if score.training and samples in (None, score.training.samples)
         }
-        exact = {it: score for it, score in found.items() if set(it.tasks) == set(SUITES[suite])}
+        exact = {it: score for it, score in found.items() if set(it.tasks) == tasks}
         options = exact or found
         if len(options) == 1:
             return next(iter(options))
         if options:
             listed = "; ".join(f"{s.agent} in {s.folders[0]}: {it}" for it, s in options.items())
             raise UsageError(
-                f"{layout.name} would mix budgets ({listed}). Its rows must have equal samples and "
+                f"{table} would mix budgets ({listed}). Its rows must have equal samples and "
                 "keyframes: choose with --samples, or name the runs with --runs."
             )
     return None
@@ -205,9 +204,9 @@ def _unfit(row: Row, score: Score, terms: Terms | None, protocol: str) -> str:
         return ""
     if score.training is None:
         return "" if row.block == OTHER else "its training budget is unknown"
-    if terms is None:
-        return ""
     theirs = score.training.terms
+    if terms is None:
+        return f"{theirs.samples:,} samples, and no row has the table's budget"
     if row.agent == EQUAL_COMPUTE:
         theirs = replace(theirs, samples=terms.samples)
     return theirs.unlike(terms)

@@ -1,6 +1,6 @@
 """Play one episode as the evaluation does, and photograph every keyframe. Runs in a child process.
 
-`Tracer` is a handler factory for `sacil_tasks.workers.run_jobs`; the simulator is imported there.
+`tracer` is a handler factory for `sacil_tasks.workers.run_jobs`; the simulator is imported there.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import numpy as np
 
 from leaderboard.entry import Entry
 from leaderboard.records import EpisodeKey, EpisodeRecord
-from leaderboard.strip import Camera, Course, Image, Step
+from leaderboard.strip import Camera, Course, Image, Step, columns_of
 from leaderboard.worker import Choice
 from sacil_tasks.interface import Keyframe
 
@@ -39,10 +39,10 @@ class Traced:
 
 @dataclass
 class Photographer:
-    """Watches an episode: a photograph before the first keyframe and after each."""
+    """Watches an episode: a photograph before the first keyframe and after each that is shown."""
 
-    photos: list[Image] = field(default_factory=list)
-    moves: list[tuple[Keyframe, str | None]] = field(default_factory=list)
+    start: Image | None = None
+    steps: list[Step] = field(default_factory=list)
     expert: list[Keyframe] = field(default_factory=list)
     camera: Camera | None = None
 
@@ -50,31 +50,25 @@ class Photographer:
         """Ask the expert for its plan and photograph the start."""
         self.expert = [stage.expert_keyframe(k) for k in range(stage.spec.keyframes)]
         self.camera = _camera(stage)
-        self.photos.append(_photo(stage))
+        self.start = _photo(stage)
 
     def moved(self, stage: "Stage", keyframe: Keyframe, refusal: str | None) -> None:
         """Note what the agent asked for and photograph what came of it."""
-        self.moves.append((keyframe, refusal))
-        self.photos.append(_photo(stage))
+        shown = len(self.steps) < columns_of(self.expert)
+        self.steps.append(Step(keyframe, refusal, _photo(stage) if shown else None))
 
     def course(self, record: EpisodeRecord) -> Course | None:
         """What was seen."""
-        if self.camera is None:
+        if self.camera is None or self.start is None:
             return None
         took = ", ".join(record.handled) or "nothing"
         title = f"{record.agent}: {record.outcome}, took {took}"
-        shots = zip(self.moves, self.photos[1:], strict=True)
-        steps = [Step(*move, photo) for move, photo in shots]
-        return Course(title, self.photos[0], steps, self.expert, self.camera)
+        return Course(title, self.start, self.steps, self.expert, self.camera)
 
 
-@dataclass(frozen=True)
-class Tracer:
-    """Plays cases."""
-
-    def __call__(self) -> Callable[[Case], Traced]:
-        """The handler."""
-        return trace
+def tracer() -> Callable[[Case], Traced]:
+    """Handler of cases."""
+    return trace
 
 
 def trace(case: Case) -> Traced:

@@ -40,9 +40,9 @@ class Scope:
         return found == (self.partition, self.split, self.scene_set)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Score:
-    """The episodes of one set of weights on one task."""
+    """The episodes of one set of weights on one task; filled run by run."""
 
     agent: str
     privileged: bool

@@ -65,8 +65,8 @@ class Step:
     refusal: str | None
     """Why it was not executed."""
 
-    photo: Image
-    """The scene after it."""
+    photo: Image | None
+    """The scene after it; None for a keyframe that no strip shows."""
 
 
 @dataclass(frozen=True)
@@ -90,36 +90,42 @@ class Course:
 
 def draw(headline: str, courses: Sequence[Course]) -> Image:
     """The picture of one scene, with its words above."""
-    columns = 1 + max(_shown(course) for course in courses)
+    columns = 1 + max(len(_shown(course)) for course in courses)
     rows = [_row(course, columns) for course in courses]
     width = rows[0].shape[1]
     return np.concatenate([_text([headline], width, BLACK), *rows])
 
 
-def tile(course: Course, number: int) -> Image:
+def columns_of(expert: Sequence[Keyframe]) -> int:
+    """How many keyframes a strip shows."""
+    return len(expert) + EXTRA_COLUMNS
+
+
+def _tile(course: Course, number: int, photo: Image) -> Image:
     """One keyframe: the photograph with both positions marked, and the deviation under it."""
     step, deviation = course.steps[number], course.deviation(number)
     colour = GREY if deviation is None else GREEN if deviation.aligned else RED
-    photo = _resized(step.photo)
+    small = _resized(photo)
     if number < len(course.expert):
-        camera = course.camera.scaled(_PHOTO_PIXELS / len(step.photo))
-        _mark(photo, camera, step.keyframe, course.expert[number], colour)
+        camera = course.camera.scaled(_PHOTO_PIXELS / len(photo))
+        _mark(small, camera, step.keyframe, course.expert[number], colour)
     caption = "beyond the expert's last" if deviation is None else str(deviation)
     if step.refusal:
         caption, colour = f"{caption}; {step.refusal}", RED
-    return _framed(photo, f"{number + 1}: {caption}", colour)
+    return _framed(small, f"{number + 1}: {caption}", colour)
 
 
-def _shown(course: Course) -> int:
-    return min(len(course.steps), len(course.expert) + EXTRA_COLUMNS)
+def _shown(course: Course) -> list[Image]:
+    photos = [step.photo for step in course.steps[: columns_of(course.expert)]]
+    return [photo for photo in photos if photo is not None]
 
 
 def _row(course: Course, columns: int) -> Image:
-    count = _shown(course)
+    photos = _shown(course)
     start = _framed(_resized(course.start), "start", GREY)
-    tiles = [start, *(tile(course, k) for k in range(count))]
+    tiles = [start, *(_tile(course, k, photo) for k, photo in enumerate(photos))]
     tiles += [np.full_like(tiles[0], 255)] * (columns - len(tiles))
-    hidden = len(course.steps) - count
+    hidden = len(course.steps) - len(photos)
     title = course.title + (f" ({hidden} more keyframes not shown)" if hidden else "")
     strip = np.concatenate(tiles, axis=1)
     return np.concatenate([_text([title], strip.shape[1], BLACK), strip])

@@ -9,10 +9,12 @@ from played import by_chance, make_training, play, read, rows, tabulate
 
 from baselines import checkpoint as checkpoints
 from leaderboard import training as trainings
+from leaderboard.agents import find_agent
 from leaderboard.layout import EQUAL_COMPUTE, SUITES, TABLES
 from leaderboard.manifest import MANIFEST_FILE
 from leaderboard.records import EPISODES_FILE
 from leaderboard.stats import Tally, wilson
+from leaderboard.worker import Choice, look_at
 from sacil_tasks.catalog import suite_tasks
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -217,16 +219,15 @@ def test_tables_are_the_same_again(everything):
 
 
 def test_the_committed_results_make_tables(tmp_path):
-    out = tabulate(RESULTS / "test", out=tmp_path)
-    committed = [
-        (folder.name, line)
-        for folder in (RESULTS / "test").iterdir()
-        for line in read(folder / "summary.csv")
-        if line["split"] == "canon"
-    ]
-    cells = {(it["agent"], it["task"]): it for it in read(out / "cells.csv")}
-    for _, line in committed:
-        cell = cells[line["agent"], line["task"]]
+    out = tabulate(RESULTS, out=tmp_path)
+    cells = [cell for cell in read(out / "cells.csv") if "+" not in cell["seed"]]
+    assert {"sacil", "rvt", *PROBES} <= {cell["agent"] for cell in cells}
+    for cell in cells:
+        (line,) = [
+            line
+            for line in read(Path(cell["run"]) / "summary.csv")
+            if (line["task"], line["split"]) == (cell["task"], cell["split"])
+        ]
         for name in ("successes", "episodes", "rate_percent", "low_percent", "high_percent"):
             assert cell[name] == line[name]
         assert cell["checkpoint"].startswith(line["checkpoint"])
@@ -250,3 +251,11 @@ def test_a_strangers_provenance_is_no_training_fact(content, tmp_path):
     (tmp_path / trainings.PROVENANCE_FILE).write_text(content)
     assert trainings.read_training(tmp_path) is None
     assert trainings.read_training(tmp_path / "weights.bin") is None
+
+
+@pytest.mark.parametrize("agent", ["rvt", "hold"])
+def test_loading_an_agent_tells_what_is_behind_its_weights(agent):
+    choice = Choice(agent=find_agent(agent), checkpoint=None, tasks=("pick_and_lift",))
+    look = look_at(choice)
+    assert look.training == trainings.training_behind(None, look.checkpoint)
+    assert (look.training is None) == (agent == "hold")

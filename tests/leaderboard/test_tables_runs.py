@@ -83,6 +83,27 @@ def test_two_budgets_of_the_agent_compared_with_must_be_chosen_from(runs):
     assert line["sacil"]["samples"] == "24000"
     assert line["rvt"]["note"].startswith("left out: 120,000 samples, not 24,000")
     assert rows(tabulate(runs, samples=120_000))["rvt"]["note"] == ""
+    line = rows(tabulate(runs, samples=7))["rvt"]
+    assert line["average"] == ""
+    assert "left out: 120,000 samples, and no row has the table's budget" in line["note"]
+
+
+def test_budgets_are_not_mixed_where_the_agent_compared_with_is_missing(tmp_path):
+    folder = tmp_path / "runs"
+    for agent, samples in [("rvt", 60_000), ("act3d", 120_000)]:
+        play(folder / agent, agent, training=make_training(agent, samples=samples))
+    with pytest.raises(UsageError, match=r"table1_single would mix budgets \(act3d in .*; rvt in "):
+        tabulate(folder)
+
+
+def test_variants_that_the_paper_lacks_keep_to_the_same_terms(runs):
+    for agent, samples in [("sacil:patch_stem", 120_000), ("sacil:conditioned_contrast", 60_000)]:
+        play(runs / agent[6:], agent, training=make_training(agent, samples=samples))
+    found = rows(tabulate(runs))
+    assert found["sacil:patch_stem"]["block"] == "other"
+    assert found["sacil:patch_stem"]["average"] != "" == found["sacil:patch_stem"]["note"]
+    assert found["sacil:conditioned_contrast"]["average"] == ""
+    assert "60,000 samples, not 120,000" in found["sacil:conditioned_contrast"]["note"]
 
 
 def test_networks_trained_on_just_the_tables_tasks_come_first(runs):
