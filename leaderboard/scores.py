@@ -95,10 +95,10 @@ def find_runs(places: Iterable[Path]) -> list[EvalRun]:
 
 
 def collect(runs: Iterable[EvalRun], scope: Scope) -> list[Score]:
-    """Group the episodes of a scope, and check that all agents met the same scenes.
+    """Group the episodes of a scope by weights and task.
 
     Raises:
-        UsageError: two folders disagree on an episode, or on what was shown in it.
+        UsageError: two folders disagree on an episode.
     """
     scores: dict[tuple[str, ...], Score] = {}
     for run in runs:
