@@ -112,7 +112,7 @@ def partition_of(seed: object) -> str:
         UsageError: the seed has more than 32 bits or is negative.
     """
     for partition, (first, count) in _RANGES.items():
-        if isinstance(seed, int) and first <= seed < first + count:
+        if isinstance(seed, int | np.integer) and first <= seed < first + count:
             return partition
     raise UsageError(f"a seed is an integer from 0 to {2**SEED_BITS - 1}, but {seed!r} came.")
 
