@@ -7,6 +7,7 @@ or say what is not meant.
 from collections.abc import Mapping
 from typing import Any
 
+from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import (
     Slots,
     check_slots,
@@ -28,7 +29,11 @@ def check_options(task: TaskSpec, split: str, options: Mapping[str, Any]) -> Non
     """
     check_split(task, split)
     if "slots" in options:
-        check_slots(task, options["slots"], split)
+        slots = options["slots"]
+        if not isinstance(slots, dict):
+            example = variations(task, split)[0]
+            raise UsageError(f"slots are words by name, such as {example}, but {slots!r} came.")
+        check_slots(task, slots, split)
     if "template" in options:
         check_template(task, options["template"])
 

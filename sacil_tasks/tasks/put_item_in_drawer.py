@@ -85,6 +85,7 @@ class PutItemInDrawerEnv(PlacingEnv):
     - strictly: no other cube was acquired or displaced
     """
 
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = (*PlacingEnv.RESET_OPTIONS, "drawer_open")
     task: ClassVar[TaskSpec] = SPEC
     fixture: Articulation
 
