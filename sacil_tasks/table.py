@@ -19,16 +19,7 @@ from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from sacil_tasks import (
-    cameras,
-    instructions,
-    props,
-    robot_looks,
-    scenes,
-    simulation,
-    sizes,
-    wording,
-)
+from sacil_tasks import cameras, instructions, props, scenes, simulation, sizes, wording
 from sacil_tasks.contacts import ContactLog
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
@@ -36,6 +27,7 @@ from sacil_tasks.instructions import Slots
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.poses import BASE_IN_WORLD_M, upright
+from sacil_tasks.robot_looks import lighten
 from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.variant import AWAY_M, Variant
@@ -55,10 +47,7 @@ class SizedTableEnv(BaseEnv):
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda"]
     SUPPORTED_REWARD_MODES: ClassVar[tuple[str, ...]] = ("sparse", "none")
-    RESET_OPTIONS: ClassVar[tuple[str, ...]] = (
-        *("slots", "template", "split"),
-        *("reconfigure", "env_idx", "reset_to_env_states"),  # ManiSkill's own
-    )
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = wording.RESET_OPTIONS
     agent: Panda
 
     task: ClassVar[TaskSpec]
@@ -267,9 +256,9 @@ class SizedTableEnv(BaseEnv):
         return super().reset(seed, options)
 
     def _check_options(self, options: dict[str, Any]) -> None:
-        for name in options:
-            find_name(name, self.RESET_OPTIONS, "reset option")
-        rebuild = self._will_rebuild(options)
+        wording.check_names(options, self.RESET_OPTIONS)
+        due = self.reconfiguration_freq != 0 and self._reconfig_counter == 0
+        rebuild = due or options.get("reconfigure", False)
         split = options.get("split", "canon" if rebuild else self._split)
         wording.check_options(self.task, split, options)
         if split != self._split and not rebuild:
@@ -278,14 +267,10 @@ class SizedTableEnv(BaseEnv):
                 'add "reconfigure": True to the options.'
             )
 
-    def _will_rebuild(self, options: dict[str, Any]) -> bool:
-        due = self.reconfiguration_freq != 0 and self._reconfig_counter == 0
-        return due or options.get("reconfigure", False)
-
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE_IN_WORLD_M))
         if self.scene.can_render():
-            robot_looks.lighten(self.agent.robot)
+            lighten(self.agent.robot)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")

@@ -6,7 +6,7 @@ import pytest
 import sapien
 import trimesh
 
-from sacil_tasks import robot_looks
+from sacil_tasks import robot_looks, table
 from sacil_tasks.cameras import observe
 from sacil_tasks.catalog import env_id
 
@@ -48,7 +48,7 @@ def test_cameras_see_the_same_scene_with_a_tenth_of_the_triangles(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     light, few, shapes = _seen()
-    monkeypatch.setattr(robot_looks, "lighten", lambda robot: None)
+    monkeypatch.setattr(table, "lighten", lambda robot: None)
     full, many, as_many = _seen()
     assert shapes == as_many
     assert few < many / 7
