@@ -5,6 +5,7 @@ neither torch nor ManiSkill; a reset builds new geometry. Processor time of all 
 busy machine disturbs little; medians where something happens often.
 """
 
+import resource
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -98,7 +99,7 @@ def cpu_s(work: Callable[[], object]) -> float:
 def resident_mb() -> float:
     """Memory of this process that is in use."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
+    return pages * resource.getpagesize() / 1e6
 
 
 if __name__ == "__main__":
