@@ -332,7 +332,7 @@ def _stack(parts: list[Any]) -> Any:
         rows[name] = lambda *_, value=rows[name]: value
     if "pose" in rows:
         rows["pose"] = Pose.create(rows["pose"])
-    return SimpleNamespace(**rows)
+    return SimpleNamespace(**rows, batched=True)
 
 
 def _act(executor: KeyframeExecutor, env: SizedTableEnv) -> None:
