@@ -1,29 +1,79 @@
 """How good are a network's keyframes on held-out demos? Needs no simulator.
 
-Every keyframe is predicted from the demo's own observation (teacher forcing). Counts are
-reported beside their totals, so rows of several runs can be added up.
+Every keyframe is predicted from the demo's own observation (teacher forcing), so what is chosen
+is judged apart from how well the arm gets there. Counts are reported beside their totals, so rows
+of several runs can be added up. `python -m baselines.validate --agent sacil --split shift_down`
+scores a trained agent on the demos of any split.
 """
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 
+from baselines import checkpoint
 from baselines.agent import Network
+from baselines.checkpoint import find_released
 from baselines.loader import Loader
 from baselines.rotation import multiply
-from baselines.samples import Sample, Shard
+from baselines.samples import KeyframeSet, Sample, Shard
 from baselines.views import base_from_cube
-
-REACH_M = 0.06
-"""A keyframe this close to a candidate, seen from above, is meant for it."""
+from sacil_tasks.aim import nearest
+from sacil_tasks.errors import run_command
+from sacil_tasks.sizes import LABELS
 
 ROTATION_DEG = 5.0
 """A rotation is right within one bin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidateConfig:
+    """Score a trained agent on demos, without a simulator."""
+
+    agent: str = "sacil"
+    """Name of the agent, `name` or `name:variant`."""
+
+    checkpoint: Path | None = None
+    """Folder with trained weights; without it, the agent's released ones."""
+
+    tasks: tuple[str, ...] = ("pick_and_lift", "pick_up_cup", "push_buttons")
+    """Tasks by name."""
+
+    data: Path = Path("data")
+    """Folder of all data."""
+
+    split: str = "canon"
+    """Split of the demos."""
+
+    partition: Literal["val", "train"] = "val"
+    """Scenes of the demos."""
+
+
+def main(config: ValidateConfig) -> None:
+    """Print the scores of each task.
+
+    Raises:
+        UsageError: a checkpoint or keyframes are missing, damaged or do not fit.
+    """
+    folder = config.checkpoint or find_released(config.agent, config.tasks)
+    trained = checkpoint.load(folder, agent=config.agent, tasks=config.tasks)
+    keyframes = KeyframeSet.load(
+        config.data / config.split / config.partition / "keyframes", config.tasks
+    )
+    settings = trained.identity.config
+    loader = Loader(
+        keyframes, trained.text, pixels=settings.pixels, recipe=settings.recipe, seed=0, goals=False
+    )
+    for name, scores in validate(trained.network, loader).items():
+        if "/" not in name:
+            print(name, json.dumps(scores))
 
 
 @dataclass(frozen=True)
@@ -38,8 +88,17 @@ class Score:
     position_mm: float
     rotation_deg: float
     gripper_right: bool
-    selected: bool | None
-    """Whether the candidate reached for is the right one; None where none is meant."""
+    slot: int
+    """How many candidates have been handled before."""
+    asked: str
+    """Size of the candidate that is meant; empty where none is."""
+    took: str
+    """Size of the candidate reached for; empty where none is near."""
+
+    @property
+    def selected(self) -> bool | None:
+        """Whether the candidate reached for is the right one; None where none is meant."""
+        return self.asked == self.took if self.asked else None
 
 
 def validate(network: Network, loader: Loader, *, batch: int = 16) -> dict[str, Any]:
@@ -63,6 +122,17 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
         "gripper_right": sum(s.gripper_right for s in scores),
         "selected_by_words": _tally([s for s in meant if s.choice]),
         "selected_by_hand": _tally([s for s in meant if not s.choice]),
+        **{
+            f"selected_in_slot_{slot + 1}": _tally(
+                [s for s in meant if s.choice and s.slot == slot]
+            )
+            for slot in sorted({s.slot for s in meant if s.choice})
+        },
+        "took_when_asked": {
+            asked: [sum(s.took == took for s in group) for took in LABELS]
+            for asked in LABELS
+            if (group := [s for s in meant if s.choice and s.asked == asked])
+        },
     }
 
 
@@ -80,28 +150,30 @@ def _score_batch(network: Network, loader: Loader, samples: list[Sample]) -> Ite
         shard = loader.keyframes.shards[sample.shard]
         asked = shard.columns["keyframe_in_base"][sample.row]
         reached = base_from_cube(chosen.position_in_cube[i]).numpy()
-        words = shard.episodes[loader.keyframes.episode(sample)].slots.values()
+        episode = loader.keyframes.episode(sample)
+        words, choices = shard.episodes[episode].slots.values(), shard.choices(episode)
+        meant, took = _choices(shard, sample.row, reached)
         yield Score(
             group=(shard.task, "+".join(words)),
-            choice=sample.row in shard.choices(loader.keyframes.episode(sample)),
+            choice=sample.row in choices,
+            slot=sum(row < sample.row for row in choices[1:]) + (sample.row in choices[1:]),
             position_mm=1000 * float(np.linalg.norm(reached - asked[:3])),
             rotation_deg=grip_angle_deg(chosen.quaternion_wxyz[i].numpy(), asked[3:]),
             gripper_right=bool(right[i]),
-            selected=_selected(shard, sample.row, reached),
+            asked=meant,
+            took=took,
         )
 
 
-def _selected(shard: Shard, row: int, reached: Float[np.ndarray, "3"]) -> bool | None:
+def _choices(shard: Shard, row: int, reached: Float[np.ndarray, "3"]) -> tuple[str, str]:
+    """Sizes of the candidates that the demo and the network reach for; empty for none."""
     candidates, target = shard.columns["candidate_in_base"][row], shard.columns["target_index"][row]
+    sizes_m = shard.episodes[shard.columns["episode_id"][row]].sizes_m
+    labels = [LABELS[rank] for rank in np.argsort(np.argsort(sizes_m))]
     if target < 0 or nearest(candidates, shard.columns["keyframe_in_base"][row, :3]) != target:
-        return None
-    return nearest(candidates, reached) == target
-
-
-def nearest(candidates: Float[np.ndarray, "k 3"], position: Float[np.ndarray, "3"]) -> int | None:
-    """The candidate within `REACH_M` of `position` seen from above, or None."""
-    distances = np.linalg.norm(candidates[:, :2] - position[:2], axis=-1)
-    return int(distances.argmin()) if distances.min() <= REACH_M else None
+        return "", ""
+    found = nearest(candidates, reached)
+    return labels[target], "" if found is None else labels[found]
 
 
 def grip_angle_deg(first: Float[np.ndarray, "4"], second: Float[np.ndarray, "4"]) -> float:
@@ -109,3 +181,7 @@ def grip_angle_deg(first: Float[np.ndarray, "4"], second: Float[np.ndarray, "4"]
     twin = multiply(first, np.array([0.0, 0.0, 0.0, 1.0]))
     cosine = max(abs(first @ second), abs(twin @ second))
     return float(np.degrees(2 * np.arccos(min(cosine, 1.0))))
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(ValidateConfig, description=__doc__)))

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from leaderboard.protocol import protocol_name
 from leaderboard.records import BROKE_OFF, ERROR, EpisodeKey, EpisodeRecord
 from sacil_tasks.catalog import task_spec
 from sacil_tasks.instructions import variations
@@ -23,7 +24,7 @@ class Entry:
     """SHA-256 of its weights; None for agents without."""
 
     protocols: Mapping[str, str]
-    """Short hash of each task's `EvalProtocol`."""
+    """Short hash of the `EvalProtocol` of each task, or of task and split (`protocol_name`)."""
 
     def identity(self, key: EpisodeKey) -> dict[str, Any]:
         """Fields of the record of `key` that do not depend on what happens in it."""
@@ -31,8 +32,8 @@ class Entry:
             "agent": self.agent,
             "privileged": self.privileged,
             "checkpoint": self.checkpoint,
-            "protocol": self.protocols[key.task],
-            "slots": variations(task_spec(key.task))[key.variation],
+            "protocol": self.protocols[protocol_name(key.task, key.split)],
+            "slots": variations(task_spec(key.task), key.split)[key.variation],
         }
 
     def lost(self, key: EpisodeKey, reason: str) -> EpisodeRecord:

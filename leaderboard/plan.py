@@ -5,15 +5,14 @@ The words of one scene stay together, so that its worker plans and accepts the s
 (D-episodes).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 
 from leaderboard.records import EpisodeKey
 from sacil_tasks.catalog import task_spec
-from sacil_tasks.errors import UsageError, find_name
+from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import variations
-from sacil_tasks.sizes import SPLITS
 
 
 @dataclass(frozen=True)
@@ -27,44 +26,33 @@ class SceneJob:
         return [SceneJob((key,)) for key in self.keys]
 
 
-def whole_scenes(task: str, episodes: int) -> int:
+def words_per_scene(task: str, split: str) -> int:
+    """How many episodes a scene is."""
+    return len(variations(task_spec(task), split))
+
+
+def whole_scenes(task: str, split: str, episodes: int) -> int:
     """`episodes` rounded up, so that every scene is met under all of its words."""
-    per_scene = len(variations(task_spec(task)))
-    return -(-episodes // per_scene) * per_scene
+    return -(-episodes // words_per_scene(task, split)) * words_per_scene(task, split)
 
 
 def plan_episodes(
-    tasks: Sequence[str], splits: Sequence[str], partition: str, scene_set: int, episodes: int
+    pairs: Iterable[tuple[str, str]], partition: str, scene_set: int, episodes: int
 ) -> list[EpisodeKey]:
-    """Keys of at least `episodes` episodes for each task and split.
+    """Keys of at least `episodes` episodes for each pair of a task and a split that it has.
 
     Raises:
-        UsageError: a name is unknown, a task has no such split, or the number is not positive.
+        UsageError: the number is not positive.
     """
     if episodes < 1:
         raise UsageError(f"--episodes must be at least 1, but {episodes} came.")
-    for split in splits:
-        find_name(split, SPLITS, "split")
-    for task in tasks:
-        _check_splits(task, splits)
     return [
-        EpisodeKey(task, split, partition, scene_set, *divmod(i, len(variations(task_spec(task)))))
-        for task in dict.fromkeys(tasks)
-        for split in dict.fromkeys(splits)
-        for i in range(whole_scenes(task, episodes))
+        EpisodeKey(task, split, partition, scene_set, *divmod(i, words_per_scene(task, split)))
+        for task, split in pairs
+        for i in range(whole_scenes(task, split, episodes))
     ]
 
 
 def scene_jobs(keys: Iterable[EpisodeKey]) -> list[SceneJob]:
     """Consecutive keys of the same scene as one job."""
     return [SceneJob(tuple(group)) for _, group in groupby(keys, key=lambda key: key[:-1])]
-
-
-def _check_splits(task: str, splits: Sequence[str]) -> None:
-    supported = task_spec(task).splits
-    missing = [split for split in splits if split not in supported]
-    if missing:
-        raise UsageError(
-            f"{task} has the splits {', '.join(supported)}, but not {', '.join(missing)}: "
-            "its largest size would not fit the gripper. Leave the task or the split out."
-        )

@@ -15,8 +15,12 @@ from sacil_tasks.files import content_hash
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, SCENE_BOUNDS, SceneBounds
 from sacil_tasks.scenes import ATTEMPTS, REGION_M
 from sacil_tasks.sizes import FAMILIES
+from sacil_tasks.splits import SPLITS
 
 HASH_LENGTH = 12
+
+UNRULED = ("canon", "shift_down", "shift_up")
+"""Splits that the size ladder alone defines; one protocol holds for all three."""
 
 Point = tuple[float, float, float]
 
@@ -34,8 +38,9 @@ class CameraPlace:
 class EvalProtocol:
     """The rules under which one task of one partition and scene set is evaluated."""
 
-    version: int = 1
-    """Raised by hand when something changes that no other field shows."""
+    version: int = 2
+    """Raised by hand when something changes that no other field shows; 2: the arm no longer dips
+    at the end of a move, and its visual meshes are lighter."""
 
     env_id: str
     """Gymnasium id; its version changes with the task's scene or success predicate."""
@@ -100,6 +105,9 @@ class EvalProtocol:
         "a refused keyframe or the budget ends the episode; strict counts"
     )
 
+    split_rules: Mapping[str, Any] = field(default_factory=dict)
+    """What a split changes in objects, sizes or words; empty where the ladder says it all."""
+
     @property
     def hash(self) -> str:
         """Short SHA-256 of all fields."""
@@ -110,13 +118,19 @@ class EvalProtocol:
         return {"hash": self.hash} | asdict(self)
 
 
-def protocol_of(task: str, partition: str, scene_set: int) -> EvalProtocol:
-    """The current protocol of a known task."""
-    spec = task_spec(task)
+def protocol_name(task: str, split: str) -> str:
+    """Key of the protocol in a manifest: splits without rules of their own share the task's."""
+    return task if split in UNRULED else f"{task}/{split}"
+
+
+def protocol_of(task: str, partition: str, scene_set: int, split: str = "canon") -> EvalProtocol:
+    """The current protocol of a known task and split."""
+    spec, rules = task_spec(task), SPLITS[split]
     return EvalProtocol(
         env_id=env_id(task),
         partition=partition,
         scene_set=scene_set,
-        templates=spec.templates,
+        templates=spec.held_out_templates if rules.held_out_templates else spec.templates,
         rungs_m=FAMILIES[spec.family].rungs_m,
+        split_rules={} if split in UNRULED else rules.rules(),
     )

@@ -26,6 +26,10 @@ SUCCEEDED, LIMIT, INVALID_ACTION, BROKE_OFF = "success", "limit", "invalid_actio
 """Why an episode ended: first lenient success, keyframes spent, action refused, exception."""
 
 
+_LATER = {"aimed"}
+"""Fields that older records lack."""
+
+
 class EpisodeKey(NamedTuple):
     """Which episode: the same key is the same scene and the same words, for every agent."""
 
@@ -92,6 +96,9 @@ class EpisodeRecord:
     """Size labels named, in order."""
     handled: tuple[str, ...] = ()
     """Size labels of the candidates acquired or pressed, in order; empty if none was."""
+    aimed: str | None = None
+    """Label of the candidate (or `clutter`) under the first keyframe that closes the gripper near
+    one; empty if there was none, None in records written before this was noted."""
     end: str
     """`success`, `limit`, `invalid_action` or `error`."""
     reason: str = ""
@@ -127,8 +134,8 @@ class EpisodeRecord:
         if not isinstance(content, dict) or content.get("schema_version") != SCHEMA_VERSION:
             raise ValueError(f"expected an object with schema_version {SCHEMA_VERSION}")
         names = {field.name for field in fields(cls)}
-        if names != content.keys():
-            raise ValueError(f"wrong or missing fields: {sorted(names ^ content.keys())}")
+        if wrong := (names ^ content.keys()) - (_LATER - content.keys()):
+            raise ValueError(f"wrong or missing fields: {sorted(wrong)}")
         lists = {name: tuple(content[name]) for name in ("sizes_m", "asked", "handled")}
         return cls(**content | lists | {"seconds": Seconds(**content["seconds"])})
 
@@ -216,7 +223,7 @@ def _parse(path: Path, number: int, line: str) -> EpisodeRecord:
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(
             f"{path} line {number} is not an episode record of schema {SCHEMA_VERSION} ({error}). "
-            "The file is damaged or foreign: move it away, or choose another folder with --out."
+            "The file is damaged or foreign: move it away, or choose another folder."
         ) from error
 
 

@@ -7,11 +7,11 @@ out of reach or in collision is an invalid action. Both count as failures.
 import hashlib
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import sapien
@@ -30,6 +30,7 @@ from leaderboard.records import (
     EpisodeRecord,
     Seconds,
 )
+from sacil_tasks.aim import nearest
 from sacil_tasks.episode import SceneKey, Stage
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Memory, Policy
@@ -44,9 +45,20 @@ class _Course:
     keyframes: int = 0
     success: bool = False
     success_lenient: bool = False
+    aimed: str = ""
     pixels: str = ""
     renderer: str = ""
     inference_s: float = 0.0
+
+
+class Witness(Protocol):
+    """Sees an episode as it is played; changes nothing."""
+
+    def begun(self, stage: Stage) -> None:
+        """The scene stands."""
+
+    def moved(self, stage: Stage, keyframe: Keyframe, refusal: str | None) -> None:
+        """A keyframe was executed, or refused."""
 
 
 class SceneRunner:
@@ -84,7 +96,11 @@ class SceneRunner:
 
 
 def run_episode(
-    stage: Stage, policy: Policy | Probe, entry: Entry, key: EpisodeKey
+    stage: Stage,
+    policy: Policy | Probe,
+    entry: Entry,
+    key: EpisodeKey,
+    witness: Witness | None = None,
 ) -> EpisodeRecord:
     """Play one episode; an exception on the way becomes part of the record.
 
@@ -95,8 +111,12 @@ def run_episode(
     course, facts = _Course(), dict[str, Any]()
     try:
         facts |= _set(stage, key)
+        if witness is not None:
+            witness.begun(stage)
         memory = _begin(stage, policy, entry, key, facts["instruction"])
-        _play(stage, policy, memory, course, privileged=entry.privileged)
+        for keyframe in _play(stage, policy, memory, course, privileged=entry.privileged):
+            if witness is not None:
+                witness.moved(stage, keyframe, course.reason or None)
         facts |= _judge(stage)
     except UsageError:
         raise
@@ -147,8 +167,9 @@ def _begin(
 
 def _play(
     stage: Stage, policy: Policy | Probe, memory: Memory, course: _Course, *, privileged: bool
-) -> None:
-    """Keyframe after keyframe, until the first lenient success, a refusal or the limit."""
+) -> Iterator[Keyframe]:
+    """Yield keyframe after keyframe, each when it has been executed or refused, until the first
+    lenient success, a refusal or the limit."""
     for _ in range(MAX_KEYFRAMES):
         if privileged:
             move = cast(Probe, policy).act_on(stage, memory)
@@ -157,15 +178,30 @@ def _play(
         if move is None:
             return
         keyframe, memory = move
+        course.aimed = course.aimed or aim(stage, keyframe)
         result = stage.execute(keyframe)
         if result.refusal is not None:
             course.end, course.reason = INVALID_ACTION, result.refusal
+            yield keyframe
             return
         course.keyframes += 1
         course.success, course.success_lenient = result.success, result.success_lenient
         if result.success_lenient:
             course.end = SUCCEEDED
+        yield keyframe
+        if result.success_lenient:
             return
+
+
+def aim(stage: Stage, keyframe: Keyframe) -> str:
+    """Label of what a closing keyframe is near to, `clutter`, or nothing."""
+    if keyframe.gripper_open:
+        return ""
+    clutter = stage.env.clutter_in_base()
+    names = (*stage.env.candidate_labels, *["clutter"] * len(clutter))
+    objects = np.concatenate([stage.env.candidate_in_base(), clutter])
+    found = nearest(objects, np.asarray(keyframe.position_m))
+    return "" if found is None else names[found]
 
 
 def _look_and_act(

@@ -24,12 +24,14 @@ from leaderboard import manifest as manifests
 from leaderboard.agents import find_agent
 from leaderboard.entry import Entry
 from leaderboard.plan import SceneJob, plan_episodes, scene_jobs, whole_scenes
-from leaderboard.protocol import EvalProtocol, protocol_of
+from leaderboard.protocol import EvalProtocol, protocol_name, protocol_of
 from leaderboard.records import EpisodeKey, EpisodeLog, EpisodeRecord, doubts
 from leaderboard.summary import console_table, write_summary
+from leaderboard.training import Training
 from leaderboard.worker import Choice, Look, Player
-from sacil_tasks.catalog import suite_tasks, task_names
-from sacil_tasks.errors import UsageError, find_name, run_command
+from sacil_tasks.catalog import suite_tasks, task_spec
+from sacil_tasks.errors import UsageError, run_command
+from sacil_tasks.splits import plan_splits
 from sacil_tasks.workers import JobFailure, run_jobs
 
 SUMMARY_FILE = "summary.csv"
@@ -50,7 +52,8 @@ class RunConfig:
     """Tasks by name, e.g. `pick_and_lift push_buttons`; they replace the suite."""
 
     split: tuple[str, ...] = ("canon",)
-    """Size splits: `canon` as trained, `shift_down` and `shift_up` one rung smaller or larger."""
+    """Splits, e.g. `canon shift_down shift_up`, or `fine` for its series of ratios; an unknown name
+    lists all. A split that a task lacks is n/a under a suite and refused with --tasks."""
 
     partition: Literal["test", "val"] = "test"
     """`val` is for decisions; `test` is for the one run whose numbers are reported."""
@@ -82,6 +85,8 @@ class Job:
     keys: tuple[EpisodeKey, ...]
     protocols: dict[str, EvalProtocol]
     folder: Path
+    missing: dict[tuple[str, str], str]
+    """Task and split -> why there is no such pair."""
 
     @classmethod
     def of(cls, config: RunConfig) -> "Job":
@@ -95,12 +100,27 @@ class Job:
         if config.checkpoint is not None and not config.checkpoint.exists():
             raise UsageError(f"there is no checkpoint at {config.checkpoint}.")
         agent = find_agent(config.agent)
-        tasks = tuple(find_name(task, task_names(), "task") for task in config.tasks)
-        tasks = tasks or suite_tasks(config.suite)
-        keys = plan_episodes(tasks, config.split, config.partition, config.seed, config.episodes)
-        protocols = {task: protocol_of(task, config.partition, config.seed) for task in tasks}
+        specs = [task_spec(task) for task in config.tasks or suite_tasks(config.suite)]
+        pairs, missing = plan_splits(specs, config.split, strict=bool(config.tasks))
+        keys = plan_episodes(pairs, config.partition, config.seed, config.episodes)
+        protocols = {
+            protocol_name(task, split): protocol_of(task, config.partition, config.seed, split)
+            for task, split in pairs
+        }
+        tasks = tuple(dict.fromkeys(task for task, _ in pairs))
         choice = Choice(agent=agent, checkpoint=config.checkpoint, tasks=tasks)
-        return cls(choice, tuple(keys), protocols, config.out or default_folder(config))
+        folder = config.out or default_folder(config)
+        return cls(choice, tuple(keys), protocols, folder, missing)
+
+    @property
+    def splits(self) -> list[str]:
+        """Splits of any task."""
+        return sorted({key.split for key in self.keys})
+
+    @property
+    def not_there(self) -> list[str]:
+        """One line for each pair that does not exist."""
+        return [f"n/a  {task} {split}: {why}." for (task, split), why in self.missing.items()]
 
 
 def default_folder(config: RunConfig) -> Path:
@@ -136,9 +156,9 @@ def main(config: RunConfig) -> None:
         agent=job.choice.agent.name,
         privileged=look.privileged,
         checkpoint=look.checkpoint,
-        protocols={task: protocol.hash for task, protocol in job.protocols.items()},
+        protocols={name: protocol.hash for name, protocol in job.protocols.items()},
     )
-    ours = _manifest(config, job, entry)
+    ours = _manifest(config, job, entry, look.training)
     theirs = manifests.read_manifest(job.folder)
     if theirs is not None:
         manifests.check_same_run(job.folder, ours, theirs)
@@ -160,10 +180,14 @@ def main(config: RunConfig) -> None:
 
 
 def _announce(config: RunConfig, job: Job) -> None:
-    for task in job.choice.tasks:
-        whole = whole_scenes(task, config.episodes)
+    rounded = {
+        (key.task, whole_scenes(key.task, key.split, config.episodes)): None for key in job.keys
+    }
+    for task, whole in rounded:
         if whole != config.episodes:
             print(f"{task}: {config.episodes} episodes are rounded up to {whole}, whole scenes.")
+    for line in job.not_there:
+        print(line)
 
 
 def _look(job: Job) -> Look:
@@ -181,17 +205,20 @@ def _look(job: Job) -> Look:
     return cast(Look, look)
 
 
-def _manifest(config: RunConfig, job: Job, entry: Entry) -> manifests.Manifest:
+def _manifest(
+    config: RunConfig, job: Job, entry: Entry, training: Training | None
+) -> manifests.Manifest:
     ours = manifests.Manifest(
         agent=entry.agent,
         privileged=entry.privileged,
         checkpoint=entry.checkpoint,
         partition=config.partition,
         scene_set=config.seed,
-        splits=sorted(set(config.split)),
-        protocols={task: protocol.described() for task, protocol in job.protocols.items()},
+        splits=job.splits,
+        protocols={name: protocol.described() for name, protocol in job.protocols.items()},
         commands=[command_line(config)],
         versions=manifests.installed_versions(),
+        training=training,
     )
     return manifests.counted(job.folder, ours)
 
@@ -235,6 +262,8 @@ def _report(job: Job, log: EpisodeLog) -> None:
     wanted = set(job.keys)
     ours = [record for record in log.records if record.key in wanted]
     print(console_table(ours))
+    for line in job.not_there:
+        print(line)
     errors = sum(record.errored for record in ours)
     if errors:
         example = next(record for record in ours if record.errored)

@@ -12,7 +12,8 @@ from itertools import groupby
 from pathlib import Path
 from statistics import fmean
 
-from leaderboard.records import INVALID_ACTION, EpisodeRecord
+from leaderboard import metrics
+from leaderboard.records import BROKE_OFF, INVALID_ACTION, LIMIT, SUCCEEDED, EpisodeRecord
 from leaderboard.stats import Tally, wilson
 from sacil_tasks.files import atomic_path, content_hash
 from sacil_tasks.outcomes import OUTCOMES
@@ -32,25 +33,6 @@ class Cell:
     def successes(self) -> Tally:
         """Strict success: the headline."""
         return Tally.of(record.success for record in self.records)
-
-    @property
-    def decisive(self) -> list[EpisodeRecord]:
-        """Episodes in which a candidate was chosen, rightly or wrongly."""
-        return [record for record in self.records if record.handled]
-
-    @property
-    def size_confusions(self) -> Tally:
-        """First choices of a size that the words do not name, among decisive episodes.
-
-        The other named object is an error of order, not of size.
-        """
-        return Tally.of(record.handled[0] not in record.asked for record in self.decisive)
-
-    def confusions(self, asked: str, handled: str) -> int:
-        """Episodes whose first named size is `asked` and whose first choice is `handled`."""
-        return sum(
-            record.asked[0] == asked and record.handled[0] == handled for record in self.decisive
-        )
 
     def asked_for(self, label: str) -> Tally:
         """Strict success of the episodes whose first named size is `label`."""
@@ -87,11 +69,10 @@ def row(cell: Cell) -> dict[str, str | int]:
         "high_percent": _percent(interval.high),
         "lenient_successes": sum(record.success_lenient for record in cell.records),
         "errors": sum(record.errored for record in cell.records),
-        "invalid_actions": sum(record.end == INVALID_ACTION for record in cell.records),
+        **{f"ended_{end}": _ended(cell, end) for end in _ENDS},
         **{f"outcome_{code.lower()}": _count(cell, code) for code in OUTCOMES},
-        "decisive": cell.size_confusions.episodes,
-        "size_confusions": cell.size_confusions.successes,
-        "size_confusion_percent": _percent(cell.size_confusions.rate),
+        **_choices(cell),
+        **_words(cell),
         **_matrix(cell),
         **_per_size(cell),
         "mean_keyframes": f"{fmean(record.keyframes for record in cell.records):.2f}",
@@ -103,26 +84,34 @@ def row(cell: Cell) -> dict[str, str | int]:
 
 
 def write_summary(path: Path, records: Iterable[EpisodeRecord]) -> None:
-    r"""Write the CSV atomically, lines ending in `\n`.
+    """Write the CSV atomically.
 
     Raises:
         UsageError: the file cannot be written.
     """
+    text = summary_text(records)
+    with atomic_path(path) as draft:
+        draft.write_text(text, encoding="utf-8", newline="")
+
+
+def summary_text(records: Iterable[EpisodeRecord]) -> str:
+    r"""The CSV, lines ending in `\n`."""
     rows = [row(cell) for cell in cells(records)]
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_path(path) as draft:
-        draft.write_text(text.getvalue(), encoding="utf-8", newline="")
+    return text.getvalue()
 
 
 def console_table(records: Iterable[EpisodeRecord]) -> str:
-    """The same cells as aligned text, the few columns that fit a terminal."""
-    lines = [
-        tuple(_CONSOLE),
-        *(tuple(show(cell) for show in _CONSOLE.values()) for cell in cells(records)),
-    ]
+    """The same cells as aligned text: what worked, then what was chosen and why it ended."""
+    found = cells(records)
+    return "\n\n".join(_aligned(columns, found) for columns in (_CONSOLE, _CHOICES))
+
+
+def _aligned(columns: Mapping[str, Callable[[Cell], str]], found: Sequence[Cell]) -> str:
+    lines = [tuple(columns), *(tuple(show(cell) for show in columns.values()) for cell in found)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
@@ -135,18 +124,38 @@ def _interval(cell: Cell) -> str:
     return f"{_percent(interval.low)}-{_percent(interval.high)}"
 
 
-_CONSOLE: Mapping[str, Callable[[Cell], str]] = {
+_ENDS = (SUCCEEDED, LIMIT, INVALID_ACTION, BROKE_OFF)
+
+_NAMES: Mapping[str, Callable[[Cell], str]] = {
     "agent": lambda cell: cell.records[0].agent + "*" * cell.records[0].privileged,
     "task": lambda cell: cell.records[0].task,
     "split": lambda cell: cell.records[0].split,
+}
+
+_CONSOLE: Mapping[str, Callable[[Cell], str]] = {
+    **_NAMES,
     "success": lambda cell: str(cell.successes),
     "%": lambda cell: _percent(cell.successes.rate),
     "95% interval": _interval,
     "lenient": lambda cell: str(Tally.of(record.success_lenient for record in cell.records)),
-    "wrong size": lambda cell: str(cell.size_confusions),
+    "wrong size": lambda cell: str(metrics.size_confusions(cell.records)),
     "errors": lambda cell: str(sum(record.errored for record in cell.records)),
     "keyframes": lambda cell: f"{fmean(record.keyframes for record in cell.records):.1f}",
     "s/episode": lambda cell: f"{fmean(record.seconds.total for record in cell.records):.2f}",
+}
+
+_CHOICES: Mapping[str, Callable[[Cell], str]] = {
+    **_NAMES,
+    "chose right": lambda cell: str(metrics.selections(cell.records, 0)),
+    "then right": lambda cell: _if_any(metrics.selections(cell.records, 1)),
+    "skill": lambda cell: _if_any(metrics.skill(cell.records)),
+    "bias": lambda cell: _signed(metrics.Bias.of(cell.records).share),
+    "absolute": lambda cell: _signed(metrics.AbsoluteBias.of(cell.records).index),
+    "words matter": lambda cell: _if_any(metrics.sensitive_scenes(cell.records)),
+    "all words right": lambda cell: str(metrics.understood_scenes(cell.records)),
+    "ended": lambda cell: ", ".join(
+        f"{end} {_ended(cell, end)}" for end in _ENDS if _ended(cell, end)
+    ),
 }
 
 
@@ -167,9 +176,57 @@ def _count(cell: Cell, code: str) -> int:
     return sum(record.outcome == code for record in cell.records)
 
 
+def _ended(cell: Cell, end: str) -> int:
+    return sum(record.end == end for record in cell.records)
+
+
+def _choices(cell: Cell) -> dict[str, str | int]:
+    """What was chosen, slot by slot, and which way it erred."""
+    wrong_sizes = metrics.size_confusions(cell.records)
+    first, second = (metrics.selections(cell.records, slot) for slot in (0, 1))
+    skill, aims = metrics.skill(cell.records), metrics.aims(cell.records)
+    bias = metrics.Bias.of(cell.records)
+    return {
+        "decisive": wrong_sizes.episodes,
+        "size_confusions": wrong_sizes.successes,
+        "size_confusion_percent": _percent(wrong_sizes.rate),
+        "first_right": first.successes,
+        "first_right_percent": _percent(first.rate),
+        "first_other_named": first.episodes - first.successes - wrong_sizes.successes,
+        "second_right": second.successes,
+        "second_decisive": second.episodes,
+        "second_right_percent": _percent(second.rate),
+        "skill_successes": skill.successes,
+        "skill_percent": _percent(skill.rate),
+        "aimed_right": aims.successes,
+        "aimed": aims.episodes,
+        "chose_smaller": bias.smaller,
+        "chose_bigger": bias.bigger,
+        "chose_extreme": bias.extreme,
+        "size_bias": _signed(bias.share),
+    }
+
+
+def _words(cell: Cell) -> dict[str, str | int]:
+    """Whether trained sizes or ranks decided, and whether words did at all."""
+    absolute = metrics.AbsoluteBias.of(cell.records)
+    sensitive = metrics.sensitive_scenes(cell.records)
+    understood = metrics.understood_scenes(cell.records)
+    return {
+        "absolute_choices": absolute.absolute,
+        "relative_choices": absolute.relative,
+        "absolute_decisive": absolute.decisive,
+        "absolute_bias_index": _signed(absolute.index),
+        "sensitive_scenes": sensitive.successes,
+        "telling_scenes": sensitive.episodes,
+        "understood_scenes": understood.successes,
+        "scenes_played": understood.episodes,
+    }
+
+
 def _matrix(cell: Cell) -> dict[str, int]:
     return {
-        f"asked_{asked}_took_{handled}": cell.confusions(asked, handled)
+        f"asked_{asked}_took_{handled}": metrics.confusions(cell.records, asked, handled)
         for asked in LABELS
         for handled in LABELS
     }
@@ -185,3 +242,11 @@ def _per_size(cell: Cell) -> dict[str, int]:
 
 def _percent(share: float | None) -> str:
     return "" if share is None else f"{100 * share:.1f}"
+
+
+def _signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.2f}"
+
+
+def _if_any(tally: Tally) -> str:
+    return str(tally) if tally.episodes else ""

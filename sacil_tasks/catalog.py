@@ -1,5 +1,4 @@
-"""Task names -> what they stand for. A task is one file in `sacil_tasks/tasks/`, nothing else;
-three of the nine tasks so far (D-partial).
+"""Task names -> what they stand for. A task is one file in `sacil_tasks/tasks/`, nothing else.
 
 The file `pick_and_lift.py` holds the literal `SPEC = TaskSpec(...)` and `class PickAndLiftEnv`.
 The spec is read from the source text, so that asking for a task's words or splits starts neither
@@ -10,10 +9,10 @@ import ast
 import importlib
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sacil_tasks.errors import find_name
-from sacil_tasks.spec import TaskSpec
+from sacil_tasks.spec import Fixture, TaskSpec
 
 if TYPE_CHECKING:
     from sacil_tasks.table import SizedTableEnv
@@ -57,13 +56,36 @@ def task_spec(task: str) -> TaskSpec:
     Raises:
         UsageError: there is no such task.
     """
-    path = _FOLDER / f"{find_name(task, task_names(), 'task')}.py"
-    for node in ast.parse(path.read_text()).body:
+    for node in _source(task).body:
         match node:
             case ast.Assign(targets=[ast.Name(id="SPEC")], value=ast.Call(keywords=keywords)):
-                fields = {str(key.arg): ast.literal_eval(key.value) for key in keywords}
-                return TaskSpec(**fields)
-    raise LookupError(f"{path.name} has no `SPEC = TaskSpec(...)` with literal arguments")
+                return TaskSpec(**{str(key.arg): _literal(key.value) for key in keywords})
+    raise LookupError(f"{task}.py has no `SPEC = TaskSpec(...)` with literal arguments")
+
+
+def task_docstrings(task: str) -> tuple[str, str]:
+    """Docstrings of a task's file and of its environment class, read without importing them.
+
+    Raises:
+        UsageError: there is no such task.
+    """
+    module, name = _source(task), f"{_camel(task)}Env"
+    for node in module.body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return ast.get_docstring(module) or "", ast.get_docstring(node) or ""
+    raise LookupError(f"{task}.py has no class {name}")
+
+
+def _source(task: str) -> ast.Module:
+    path = _FOLDER / f"{find_name(task, task_names(), 'task')}.py"
+    return ast.parse(path.read_text())
+
+
+def _literal(node: ast.expr) -> Any:
+    match node:
+        case ast.Call(func=ast.Name(id="Fixture"), keywords=keywords):
+            return Fixture(**{str(key.arg): ast.literal_eval(key.value) for key in keywords})
+    return ast.literal_eval(node)
 
 
 def suite_names() -> tuple[str, ...]:

@@ -122,7 +122,7 @@ class DemoJob:
     @property
     def variation(self) -> int:
         """The same in every redraw, so that the words stay balanced."""
-        return self.index % len(variations(task_spec(self.demos.task)))
+        return self.index % len(variations(task_spec(self.demos.task), self.demos.split))
 
     @property
     def given_up(self) -> bool:

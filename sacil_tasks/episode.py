@@ -17,14 +17,15 @@ import numpy as np
 from sacil_tasks.cameras import observe
 from sacil_tasks.catalog import env_id, task_spec
 from sacil_tasks.demos import ENV_KWARGS
-from sacil_tasks.instructions import Slots, draw_words, variations
+from sacil_tasks.instructions import Slots, variations
 from sacil_tasks.interface import MAX_KEYFRAMES, Keyframe, Observation
 from sacil_tasks.motion.executor import KeyframeExecutor
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.recording import StepRecorder
-from sacil_tasks.scenes import ATTEMPTS, scene_seed, stream
+from sacil_tasks.scenes import ATTEMPTS, scene_seed
 from sacil_tasks.table import SizedTableEnv
 from sacil_tasks.vulkan import explain_render_failure
+from sacil_tasks.wording import draw_meaning
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Stage:
         `template` None: as the scene's instruction stream draws it.
         """
         started = time.perf_counter()
-        slots = variations(self.spec)[variation]
+        slots = variations(self.spec, split)[variation]
         known = scene in self._accepted
         if not known:
             self._accepted[scene] = self._find_attempt(scene, slots, template)
@@ -151,7 +152,9 @@ class Stage:
         """The first attempt that the expert can plan; it has been reset."""
         for attempt in range(ATTEMPTS):
             self._reset(scene, attempt, slots, template, "canon")
-            if all(self._can_plan(choice) for choice in self._choices()):
+            refusal = self._executor.plan_sequences(map(self._expert, variations(self.spec)))
+            self.env.ask(slots)
+            if refusal is None:
                 return attempt
         raise RuntimeError(f"the expert can plan none of the {ATTEMPTS} attempts of {scene}")
 
@@ -161,20 +164,16 @@ class Stage:
         self.attempt = attempt
         self.seed = scene_seed(scene.partition, scene.scene_set, scene.task, scene.index, attempt)
         if template is None:
-            template = draw_words(self.spec, stream(self.seed, "instruction"))[1]
+            template = draw_meaning(self.spec, split, self.seed)[1]
         self.options = {"slots": slots, "template": template, "split": split}
         self.recorder.reset(seed=self.seed, options=dict(self.options))
         self._executor.begin()
         self._steps, self._gripper_open = 0, True
 
-    def _choices(self) -> list[tuple[int, ...]]:
-        """Candidates that each variation names."""
-        holder = {label: i for i, label in enumerate(self.env.candidate_labels)}
-        return [tuple(holder[w] for w in slots.values()) for slots in variations(self.spec)]
-
-    def _can_plan(self, choice: tuple[int, ...]) -> bool:
-        keyframes = [self.expert_keyframe(k, choice) for k in range(self.spec.keyframes)]
-        return self._executor.plan_sequence(keyframes) is None
+    def _expert(self, words: Slots) -> list[Keyframe]:
+        """All keyframes of the expert if `words` were asked for."""
+        self.env.ask(words)
+        return [self.expert_keyframe(k) for k in range(self.spec.keyframes)]
 
 
 def _make(task: str, *, render: bool) -> gym.Env:

@@ -81,7 +81,7 @@ class Events:
         """
         strength = forces_n.norm(dim=-1)
         pushes = strength > TOUCH_N
-        _append(self.touch_order, pushes.any(dim=1))
+        append_order(self.touch_order, pushes.any(dim=1))
         along = (forces_n * closing[:, None, None]).sum(-1)
         along[:, 1] *= -1
         squeezes = pushes & (along >= _GRASP_COSINE * strength)
@@ -108,10 +108,11 @@ class Events:
 
     def handle(self, now: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 3"]:
         """Latch candidates handled now; returns those that are new."""
-        return _append(self.handle_order, now)
+        return append_order(self.handle_order, now)
 
 
-def _append(order: Int[Tensor, "b 3"], now: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 3"]:
+def append_order(order: Int[Tensor, "b 3"], now: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 3"]:
+    """Number, in `order`, those that are `now` for the first time; returns which they are."""
     new = now & (order == 0)
     order += new * ((order > 0).sum(-1, keepdim=True, dtype=order.dtype) + 1)
     return new

@@ -6,7 +6,7 @@ import numpy as np
 
 from sacil_tasks.demos import MAX_FAILURES, DemoJob, ExpertFailure, Trajectory, save_part
 from sacil_tasks.episode import SceneKey, Stage
-from sacil_tasks.keyframes import Episode, KeyframeDemo
+from sacil_tasks.keyframes import NO_ROW, Episode, KeyframeDemo
 
 
 class Demonstrator:
@@ -51,7 +51,6 @@ def demonstrate(
         candidates.append(stage.env.candidate_in_base())
     if not result.success:
         return stage.outcome().code
-    order = stage.env.target_order()
     made = KeyframeDemo(
         episode=Episode(
             instruction=instruction,
@@ -64,10 +63,16 @@ def demonstrate(
         ),
         observations=observations,
         keyframes=keyframes,
-        targets=[order[stage.env.expert_target(k)] for k in range(stage.spec.keyframes)],
+        targets=[_target(stage, number) for number in range(stage.spec.keyframes)],
         candidate_in_base=np.stack(candidates),
     )
     return made, stage.recorder.trajectory()
+
+
+def _target(stage: Stage, number: int) -> int:
+    """The candidate that a keyframe serves, if it serves one."""
+    position = stage.env.expert_target(number)
+    return NO_ROW if position is None else stage.env.target_order()[position]
 
 
 def _record(stage: Stage, made: KeyframeDemo, failures: tuple[ExpertFailure, ...]) -> dict:

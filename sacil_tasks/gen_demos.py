@@ -19,7 +19,7 @@ from typing import Literal
 import tyro
 from tqdm import tqdm
 
-from sacil_tasks.catalog import suite_tasks, task_names, task_spec
+from sacil_tasks.catalog import suite_tasks, task_spec
 from sacil_tasks.demos import (
     MAX_FAILURES,
     DemoJob,
@@ -31,8 +31,9 @@ from sacil_tasks.demos import (
     merge,
     read_records,
 )
-from sacil_tasks.errors import UsageError, find_name, run_command
+from sacil_tasks.errors import UsageError, run_command
 from sacil_tasks.files import atomic_path, code_version, sole_writer
+from sacil_tasks.splits import plan_splits
 from sacil_tasks.workers import JobFailure, run_jobs
 
 EXPERT = "sacil_tasks.expert:Demonstrator"
@@ -49,14 +50,15 @@ class GenConfig:
     tasks: tuple[str, ...] = ()
     """Tasks by name; they override the suite."""
 
-    suite: str = "slice"
+    suite: str = "all"
     """A group of tasks: slice, single, dual or all."""
 
     demos: int = 100
     """Demos per task."""
 
     split: str = "canon"
-    """Sizes on the table: canon, shift_down or shift_up."""
+    """Split, e.g. canon, shift_down or mixed; fine for its series of ratios. An unknown name lists
+    all. A split that a task lacks is n/a under a suite and refused with --tasks."""
 
     partition: Literal["train", "val"] = "train"
     """Scenes to draw from; there are no demos of test scenes."""
@@ -97,10 +99,10 @@ def plan(config: GenConfig) -> list[DemoSet]:
     Raises:
         UsageError: a name or number is wrong, or the output folder cannot be written.
     """
-    tasks = config.tasks or suite_tasks(config.suite)
-    for task in tasks:
-        find_name(task, task_names(), "task")
-        find_name(config.split, task_spec(task).splits, f"split of {task}")
+    specs = [task_spec(task) for task in config.tasks or suite_tasks(config.suite)]
+    pairs, missing = plan_splits(specs, [config.split], strict=bool(config.tasks))
+    for (task, split), reason in missing.items():
+        print(f"n/a  {task} {split}: {reason}.")
     if config.demos < 1 or config.workers < 1:
         raise UsageError(
             f"--demos and --workers are at least 1, but {config.demos} and {config.workers} came."
@@ -110,12 +112,12 @@ def plan(config: GenConfig) -> list[DemoSet]:
         DemoSet(
             out=config.out,
             task=task,
-            split=config.split,
+            split=split,
             partition=config.partition,
             scene_set=config.seed,
             code_version=code_version(),
         )
-        for task in dict.fromkeys(tasks)
+        for task, split in pairs
     ]
 
 

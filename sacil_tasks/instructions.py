@@ -1,22 +1,26 @@
 """Slots of meaning -> sentences (D-words), and back-checks of what a user asks for. Pure."""
 
-from itertools import permutations
+import re
+from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
 
 from sacil_tasks.errors import UsageError, find_name
-from sacil_tasks.sizes import LABELS
 from sacil_tasks.spec import TaskSpec
+from sacil_tasks.splits import SPLITS, TRAINED, Phrases
 
 Slots: TypeAlias = dict[str, str]
-"""Size word of each slot, e.g. `{"first": "small", "second": "large"}`."""
+"""Word of each blank, e.g. `{"first": "small", "second": "large"}`."""
 
 
-def variations(spec: TaskSpec) -> tuple[Slots, ...]:
-    """Every way to fill the slots with different size words, in a fixed order."""
+def variations(spec: TaskSpec, split: str = "canon") -> tuple[Slots, ...]:
+    """Every way to fill the blanks, sizes all different, in a fixed order."""
+    labels = SPLITS[split].phrases[0]
     return tuple(
-        dict(zip(spec.slots, words, strict=True)) for words in permutations(LABELS, len(spec.slots))
+        dict(zip(spec.blanks, (*words, *places), strict=True))
+        for words in permutations(labels, len(spec.slots))
+        for places in product(*spec.receptacles.values())
     )
 
 
@@ -25,15 +29,21 @@ def all_templates(spec: TaskSpec) -> tuple[str, ...]:
     return spec.templates + spec.held_out_templates
 
 
-def render(spec: TaskSpec, slots: Slots, template: int) -> str:
-    """Fill one template.
+def render(spec: TaskSpec, slots: Slots, template: int, phrases: Phrases = TRAINED) -> str:
+    """Fill one template; `phrases` say each size of the noun that follows its blank.
 
     Raises:
         UsageError: the template index or the slots do not belong to the task.
     """
     check_template(spec, template)
     check_slots(spec, slots)
-    return all_templates(spec)[template].format(**slots)
+
+    def fill(blank: re.Match[str]) -> str:
+        return phrases[slots[blank["slot"]]].format(noun=blank["noun"])
+
+    names = "|".join(spec.slots)
+    sentence = all_templates(spec)[template]
+    return re.sub(rf"{{(?P<slot>{names})}} (?P<noun>\w+)", fill, sentence).format(**slots)
 
 
 def official_sentences(spec: TaskSpec) -> tuple[str, ...]:
@@ -45,26 +55,27 @@ def official_sentences(spec: TaskSpec) -> tuple[str, ...]:
     )
 
 
-def draw_words(spec: TaskSpec, rng: np.random.Generator) -> tuple[Slots, int]:
+def draw_words(spec: TaskSpec, rng: np.random.Generator, split: str = "canon") -> tuple[Slots, int]:
     """Slots and training template, independent and uniform."""
-    choices = variations(spec)
+    choices = variations(spec, split)
     slots = choices[int(rng.integers(len(choices)))]
     return slots, int(rng.integers(len(spec.templates)))
 
 
-def check_slots(spec: TaskSpec, slots: Slots) -> None:
-    """Accept a complete assignment of different size words.
+def check_slots(spec: TaskSpec, slots: Slots, split: str = "canon") -> None:
+    """Accept a complete assignment of words, sizes all different.
 
     Raises:
         UsageError: a slot is missing or unknown, a word is unknown or used twice.
     """
     for name, word in slots.items():
-        find_name(str(name), spec.slots, f"slot of {spec.name}")
-        find_name(str(word), LABELS, "size word")
-    if slots not in variations(spec):
+        words = spec.blanks[find_name(str(name), spec.blanks, f"slot of {spec.name}")]
+        find_name(str(word), words, "size word" if name in spec.slots else f"word for {name}")
+    choices = variations(spec, split)
+    if slots not in choices:
         raise UsageError(
-            f"slots of {spec.name} are {', '.join(spec.slots)}, each with another size word, "
-            f"but {slots} came; choose one of {list(variations(spec))}."
+            f"slots of {spec.name} are {', '.join(spec.blanks)}, each size with another word, "
+            f"but {slots} came; choose one of {list(choices)}."
         )
 
 

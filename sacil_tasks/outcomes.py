@@ -29,6 +29,9 @@ class Outcome:
     handled: tuple[str, ...]
     """Labels acquired or pressed, in order."""
 
+    placed: tuple[str, ...] = ()
+    """Labels that lie in a place where the task wants something."""
+
     handled_indices: tuple[int, ...]
     """The same as candidate indices."""
 
@@ -39,7 +42,10 @@ class Outcome:
     """Labels pushed away without being acquired."""
 
     wrong_receptacle: bool = False
-    """Something was put into a place that was not named."""
+    """A place that was not named was opened or filled."""
+
+    robot_contact_n: float = 0.0
+    """Largest force of a contact that nobody intended, for example an arm brushing a handle."""
 
     @property
     def first_choice(self) -> int | None:
@@ -52,11 +58,16 @@ class Outcome:
         return bool(self.handled) and self.handled[0] not in self.asked
 
     @property
+    def clean(self) -> bool:
+        """Strict success without an unintended contact."""
+        return self.success and not self.robot_contact_n
+
+    @property
     def code(self) -> str:
         """The first code of `OUTCOMES` that fits."""
         if self.success:
             return "SUCCESS"
-        if set(self.handled) - set(self.asked):
+        if set(self.handled + self.placed) - set(self.asked):
             return "SIZE_CONFUSION"
         if self.handled != self.asked[: len(self.handled)]:
             return "ORDER_ERROR"

@@ -1,4 +1,4 @@
-"""Candidates and fixtures: visuals from meshes, collision from primitives only.
+"""Table, candidates and markers: visuals from meshes, collision from primitives and small hulls.
 
 Every builder takes the parallel scene it builds in, so that sizes may differ from scene to scene;
 `build_each` merges the results into one batched object.
@@ -10,9 +10,11 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 import sapien
 import trimesh
+from jaxtyping import Float64
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.structs import Actor, Articulation
+from sapien import physx
 from sapien.wrapper.articulation_builder import LinkBuilder
 from torch import Tensor
 from transforms3d.euler import euler2quat
@@ -25,6 +27,13 @@ BLOCK_DENSITY = 300.0
 CUP_MASS_KG = 0.06
 CUP_FACETS = 12
 CUP_FLOOR_M = 0.004
+PEPPER_DENSITY = 300.0
+_PEPPER_PROFILE = (
+    *((0.0, 0.62), (0.12, 0.84), (0.32, 0.97), (0.55, 1.0)),
+    *((0.78, 0.96), (0.92, 0.80), (1.0, 0.50)),
+)
+"""Share of the height, share of the width there."""
+
 BUTTON_BASE_M = 0.02
 BUTTON_TRAVEL_M = 0.008
 BUTTON_CAP_M = 0.018
@@ -57,7 +66,7 @@ def build_table(scene: ManiSkillScene) -> Actor:
     half = (0.6045, 1.209, 0.46)
     builder.add_box_collision(half_size=half)
     if scene.can_render():
-        builder.add_box_visual(half_size=half, material=_matte((0.52, 0.50, 0.47)))
+        builder.add_box_visual(half_size=half, material=matte((0.52, 0.50, 0.47)))
     builder.initial_pose = sapien.Pose([-0.12, 0, -half[2]])
     return builder.build_static(name="table")
 
@@ -68,13 +77,21 @@ def build_block(scene: ManiSkillScene, index: int, name: str, edge_m: float, rgb
     half = [edge_m / 2] * 3
     builder.add_box_collision(half_size=half, density=BLOCK_DENSITY)
     if scene.can_render():
-        builder.add_box_visual(half_size=half, material=_matte(rgb))
+        builder.add_box_visual(half_size=half, material=matte(rgb))
     return builder.build_dynamic(name=name)
 
 
 def cup_height_m(diameter_m: Length) -> Length:
     """Height of a cup of this outer diameter."""
     return 1.3 * diameter_m
+
+
+def cup_grasp_yaw(heading_rad: float) -> float:
+    """Gripper yaw that closes across the handle, on two flat facets of the wall.
+
+    Of the two, half a turn apart, the one in (-90, 90] degrees.
+    """
+    return np.pi / 2 - (np.pi / 2 - heading_rad) % np.pi
 
 
 def build_cup(scene: ManiSkillScene, index: int, name: str, diameter_m: float, rgb: Rgb) -> Actor:
@@ -90,7 +107,7 @@ def build_cup(scene: ManiSkillScene, index: int, name: str, diameter_m: float, r
     for pose, half in boxes:
         builder.add_box_collision(pose, half, density=CUP_MASS_KG / volume_m3)
     if scene.can_render():
-        _add_mesh(builder, _cup_mesh(diameter_m, wall_m), _matte(rgb))
+        _add_mesh(builder, _cup_mesh(diameter_m, wall_m), matte(rgb))
     return builder.build_dynamic(name=name)
 
 
@@ -135,6 +152,87 @@ def _handle_mesh(diameter_m: float) -> trimesh.Trimesh:
     return ring
 
 
+def pepper_height_m(width_m: Length) -> Length:
+    """Height of a pepper of this width, without its stem."""
+    return 1.1 * width_m
+
+
+def build_pepper(scene: ManiSkillScene, index: int, name: str, width_m: float, rgb: Rgb) -> Actor:
+    """Bell pepper with four lobes along x and y, origin at the middle of its height.
+
+    A hull collides; the stem is for the eye only.
+    """
+    builder = _HullBuilder(_pepper_rings(8).reshape(-1, 3) * width_m, PEPPER_DENSITY)
+    builder.set_scene(scene)
+    builder.set_scene_idxs([index])
+    builder.initial_pose = sapien.Pose([0, 0, 1])
+    if scene.can_render():
+        _add_mesh(builder, _pepper_mesh(width_m), matte(rgb))
+        stem = trimesh.creation.cylinder(0.07 * width_m, 0.15 * width_m, sections=8)
+        stem.apply_translation([0, 0, 0.62 * width_m])
+        _add_mesh(builder, stem, matte((0.10, 0.25, 0.04)))
+    return builder.build_dynamic(name=name)
+
+
+def _pepper_rings(sections: int) -> Float64[np.ndarray, "rings sections 3"]:
+    """Outline of a pepper of width 1, ring by ring from its flat bottom up."""
+    angle = np.arange(sections) * 2 * np.pi / sections
+    lobes = (1 + 0.08 * np.cos(4 * angle)) / 1.08
+    return np.array(
+        [
+            np.stack(
+                [
+                    reach * lobes * np.cos(angle) / 2,
+                    reach * lobes * np.sin(angle) / 2,
+                    np.full(sections, pepper_height_m(level - 0.5)),
+                ],
+                axis=1,
+            )
+            for level, reach in _PEPPER_PROFILE
+        ]
+    )
+
+
+def _pepper_mesh(width_m: float) -> trimesh.Trimesh:
+    """The outline as a closed surface; between two lobes it is hollow, unlike its hull."""
+    sections = 32
+    points = _pepper_rings(sections)
+    here = np.arange(points.shape[0] * sections).reshape(-1, sections)
+    beside = np.roll(here, -1, axis=1)
+    a, b, c, d = (part.ravel() for part in (here[:-1], beside[:-1], here[1:], beside[1:]))
+    sides = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
+    bottom, top = here[0], here[-1]
+    lids = [(bottom[0], bottom[i + 1], bottom[i]) for i in range(1, sections - 1)]
+    lids += [(top[0], top[i], top[i + 1]) for i in range(1, sections - 1)]
+    return trimesh.Trimesh(
+        points.reshape(-1, 3) * width_m, np.concatenate([sides, lids]), process=False
+    )
+
+
+class _HullBuilder(ActorBuilder):
+    """Builds actors that collide as the hull of points.
+
+    ManiSkill takes hulls from files only, and SAPIEN goes on using the first file of a name.
+    """
+
+    def __init__(self, points_m: Float64[np.ndarray, "n 3"], density: float) -> None:
+        super().__init__()
+        self._points_m = points_m
+        self._density = density
+
+    def build_physx_component(self, link_parent: object = None) -> physx.PhysxRigidBaseComponent:
+        """Add the hull to what ManiSkill builds."""
+        component = super().build_physx_component(link_parent)
+        shape = physx.PhysxCollisionShapeConvexMesh(
+            vertices=self._points_m.astype(np.float32),
+            scale=np.ones(3, dtype=np.float32),
+            material=physx.get_default_material(),
+        )
+        shape.set_density(self._density)
+        component.attach(shape)
+        return component
+
+
 def build_button(
     scene: ManiSkillScene, index: int, name: str, cap_m: float, rgb: Rgb
 ) -> Articulation:
@@ -160,7 +258,7 @@ def _add_box(scene: ManiSkillScene, link: LinkBuilder, half: list[float], rgb: R
     pose = sapien.Pose([0, 0, half[2]])
     link.add_box_collision(pose, half)
     if scene.can_render():
-        link.add_box_visual(pose, half, material=_matte(rgb))
+        link.add_box_visual(pose, half, material=matte(rgb))
 
 
 def _add_cap(scene: ManiSkillScene, cap: LinkBuilder, cap_m: float, rgb: Rgb) -> None:
@@ -177,7 +275,7 @@ def _add_cap(scene: ManiSkillScene, cap: LinkBuilder, cap_m: float, rgb: Rgb) ->
     density = CAP_MASS_KG / (np.pi * (cap_m / 2) ** 2 * BUTTON_CAP_M)
     cap.add_cylinder_collision(pose, cap_m / 2, BUTTON_CAP_M / 2, density=density)
     if scene.can_render():
-        cap.add_cylinder_visual(pose, cap_m / 2, BUTTON_CAP_M / 2, material=_matte(rgb))
+        cap.add_cylinder_visual(pose, cap_m / 2, BUTTON_CAP_M / 2, material=matte(rgb))
 
 
 def _spring(button: Articulation) -> None:
@@ -192,7 +290,7 @@ def build_marker(scene: ManiSkillScene, name: str) -> Actor:
     builder = scene.create_actor_builder()
     if scene.can_render():
         builder.add_cylinder_visual(
-            sapien.Pose(q=_UPRIGHT), 0.006, 0.0005, material=_matte((0.0, 1.0, 0.1))
+            sapien.Pose(q=_UPRIGHT), 0.006, 0.0005, material=matte((0.0, 1.0, 0.1))
         )
     builder.initial_pose = sapien.Pose([0, 0, -0.1])
     return builder.build_kinematic(name=name)
@@ -202,7 +300,7 @@ def build_goal(scene: ManiSkillScene, name: str, radius_m: float) -> Actor:
     """Pale sphere in the air that nothing can touch."""
     builder = scene.create_actor_builder()
     if scene.can_render():
-        builder.add_sphere_visual(radius=radius_m, material=_matte((0.95, 0.97, 1.0)))
+        builder.add_sphere_visual(radius=radius_m, material=matte((0.95, 0.97, 1.0)))
     builder.initial_pose = sapien.Pose([0, 0, 0.25])
     return builder.build_kinematic(name=name)
 
@@ -214,7 +312,8 @@ def _builder(scene: ManiSkillScene, index: int) -> ActorBuilder:
     return builder
 
 
-def _matte(rgb: Rgb) -> "sapien.render.RenderMaterial":
+def matte(rgb: Rgb) -> "sapien.render.RenderMaterial":
+    """Material without highlights, which would tell the light's direction and little else."""
     return sapien.render.RenderMaterial(base_color=[*rgb, 1.0], roughness=0.9, specular=0.1)
 
 

@@ -5,6 +5,7 @@ the rungs after everything else of the scene is drawn, so it never moves an obje
 Pure numpy.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +17,11 @@ LABELS = ("small", "medium", "large")
 CANDIDATES = len(LABELS)
 """Look-alikes on the table, one of each label."""
 
-FIRST_RUNG = {"canon": 1, "shift_down": 0, "shift_up": 2}
-"""Split -> rung of the small object. Training sees `canon` only; a policy that has learnt
-absolute sizes picks the wrong object in two thirds of the shifted scenes."""
+CANON_RUNG = 1
+"""Rung of the small object in training."""
 
-SPLITS = tuple(FIRST_RUNG)
+GRASPABLE_M = 0.070
+"""Widest object that the open gripper (0.080 m) straddles with room to spare."""
 
 _COMMON_JITTER = (0.96, 1.04)
 _OWN_JITTER = (0.98, 1.02)
@@ -30,23 +31,23 @@ _OWN_JITTER = (0.98, 1.02)
 class SizeFamily:
     """One ladder of sizes in metres, smallest first."""
 
-    rungs_m: tuple[float, ...]
-    """Edge of a block, outer diameter of a cup, cap diameter of a button."""
+    measure: str
+    """What of the object is as long as its size says."""
 
-    @property
-    def splits(self) -> tuple[str, ...]:
-        """Splits whose three rungs exist on this ladder."""
-        return tuple(
-            split for split, first in FIRST_RUNG.items() if first + CANDIDATES <= len(self.rungs_m)
-        )
+    rungs_m: tuple[float, ...]
+
+    def first_rungs(self, wanted: Sequence[int]) -> tuple[int, ...]:
+        """Those of `wanted` from which three rungs can be taken."""
+        return tuple(first for first in wanted if first + CANDIDATES <= len(self.rungs_m))
 
 
 FAMILIES = {
-    "block": SizeFamily((0.022, 0.029, 0.038, 0.050, 0.065)),
-    "cup": SizeFamily((0.031, 0.0395, 0.050, 0.063)),
-    "button": SizeFamily((0.018, 0.025, 0.035, 0.049, 0.068)),
+    "block": SizeFamily("edge", (0.022, 0.029, 0.038, 0.050, 0.065)),
+    "cup": SizeFamily("outer diameter", (0.031, 0.0395, 0.050, 0.063)),
+    "pepper": SizeFamily("width", (0.030, 0.038, 0.048, 0.061)),
+    "button": SizeFamily("cap diameter", (0.018, 0.025, 0.035, 0.049, 0.068)),
 }
-"""Adjacent ratios 1.31, 1.265 and 1.40; the largest cup still fits the open gripper (80 mm)."""
+"""Adjacent ratios 1.31, 1.265, 1.265 and 1.40; what is to be grasped fits the open gripper."""
 
 
 def draw_jitter(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:
@@ -58,8 +59,37 @@ def draw_jitter(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:
 
 
 def sizes_m(
-    family: str, split: str, labels: Int64[np.ndarray, "3"], jitter: Float64[np.ndarray, "3"]
+    family: str, first_rung: int, labels: Int64[np.ndarray, "3"], jitter: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "3"]:
-    """Size of each candidate in metres, for known `family` and a `split` it supports."""
+    """Size of each candidate in metres; the small one has the rung `first_rung`."""
     rungs = np.asarray(FAMILIES[family].rungs_m)
-    return rungs[FIRST_RUNG[split] + labels] * jitter
+    return rungs[first_rung + labels] * jitter
+
+
+def spread_m(
+    family: str, ratio: float, labels: Int64[np.ndarray, "3"], jitter: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3"]:
+    """Sizes of exactly this ratio around the middle rung: the jitter is common to all."""
+    common = np.exp(np.log(jitter).mean())
+    return _middle_m(FAMILIES[family]) * ratio ** (labels - 1.0) * common
+
+
+def largest_m(family: SizeFamily, ratio: float) -> float:
+    """Largest size that `spread_m` can draw."""
+    return _middle_m(family) * ratio * _COMMON_JITTER[1] * _OWN_JITTER[1]
+
+
+def absolute_choice(
+    family: str, label: str, sizes_m: Sequence[float] | Float64[np.ndarray, "k"]
+) -> int:
+    """Which of the objects is nearest to the size that `label` had in training.
+
+    What a policy takes that has learnt sizes instead of ranks: right in `canon`, wrong wherever
+    the shift moves another object nearer.
+    """
+    trained_m = FAMILIES[family].rungs_m[CANON_RUNG + LABELS.index(label)]
+    return int(np.abs(np.log(np.asarray(sizes_m) / trained_m)).argmin())
+
+
+def _middle_m(family: SizeFamily) -> float:
+    return family.rungs_m[CANON_RUNG + 1]

@@ -5,10 +5,6 @@ and the expert's keyframes. World frame: table top at z = 0, robot base at x = -
 Scenes are our own, in SAPIEN (D-simulator).
 """
 
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -19,24 +15,25 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Link, Pose
-from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from sacil_tasks import cameras, instructions, props, scenes, sizes
+from sacil_tasks import cameras, instructions, props, scenes, simulation, sizes, wording
+from sacil_tasks.contacts import ContactLog
 from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.events import Events
 from sacil_tasks.instructions import Slots
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
+from sacil_tasks.poses import BASE_IN_WORLD_M, upright
+from sacil_tasks.robot_looks import lighten
 from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
+from sacil_tasks.variant import AWAY_M, Variant
 
 HOME_QPOS = (0.0, 0.0, 0.0, -1.5, 0.0, 1.5, np.pi / 4, 0.04, 0.04)
 """Arm and fingers at the start: the gripper looks straight down, high above the table."""
-
-BASE_IN_WORLD_M = (-0.615, 0.0, 0.0)
 
 
 class SizedTableEnv(BaseEnv):
@@ -50,6 +47,7 @@ class SizedTableEnv(BaseEnv):
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda"]
     SUPPORTED_REWARD_MODES: ClassVar[tuple[str, ...]] = ("sparse", "none")
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = wording.RESET_OPTIONS
     agent: Panda
 
     task: ClassVar[TaskSpec]
@@ -63,6 +61,7 @@ class SizedTableEnv(BaseEnv):
         *args: Any,
         robot_uids: str = "panda",
         num_envs: int = 1,
+        reward_mode: str | None = None,
         camera_rig: str = "aimed",
         reconfiguration_freq: int | None = None,
         enhanced_determinism: bool = True,
@@ -71,17 +70,21 @@ class SizedTableEnv(BaseEnv):
         """Build the first scene; what is not named here goes to ManiSkill.
 
         Raises:
-            UsageError: the camera rig is unknown.
+            UsageError: the camera rig or reward mode is unknown, or this machine cannot simulate
+                several environments at once.
         """
+        simulation.check_parallel(num_envs, kwargs.get("sim_backend", "auto"))
+        find_name(reward_mode or "none", self.SUPPORTED_REWARD_MODES, "reward mode")
         self._rig = cameras.RIGS[find_name(camera_rig, cameras.RIGS, "camera rig")]
         self._split = "canon"
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
-        _spare_imports_from_collection()
+        simulation.spare_imports_from_collection()
         super().__init__(
             *args,
             robot_uids=robot_uids,
             num_envs=num_envs,
+            reward_mode=reward_mode,
             reconfiguration_freq=reconfiguration_freq,
             enhanced_determinism=enhanced_determinism,
             **kwargs,
@@ -94,8 +97,12 @@ class SizedTableEnv(BaseEnv):
         raise NotImplementedError
 
     def _rest_height_m(self, sizes_m: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """Height of each candidate's origin when it stands on the table."""
+        """Height of each candidate's origin where it stands at the start."""
         raise NotImplementedError
+
+    def _rest_quaternions(self, yaw_rad: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 4"]:
+        """Orientation of each candidate (wxyz) at the start, given its heading."""
+        return upright(yaw_rad)
 
     def _load_extras(self) -> None:
         """Build what the scene holds besides the candidates."""
@@ -111,6 +118,22 @@ class SizedTableEnv(BaseEnv):
         """The task's predicate, given the indices of the named candidates."""
         raise NotImplementedError
 
+    def _receptacles(self) -> Int[Tensor, "b 3"]:
+        """Index of the place that each candidate was put into, or -1."""
+        return torch.full_like(self._labels, -1)
+
+    def _wrong_receptacle(self, i: int) -> bool:
+        """Whether a place that was not named has been opened or filled in environment `i`."""
+        return False
+
+    def _handles(self) -> list[Link]:
+        """What else the fingers may touch now, besides the candidates."""
+        return []
+
+    def _task_state(self) -> dict[str, Tensor]:
+        """What an episode is besides physics and events, each "b n"; restored in place."""
+        return {"asked": self._asked, "template": self._template}
+
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         """All keyframes of the expert in environment 0, handling `choice` in order."""
         raise NotImplementedError
@@ -120,14 +143,25 @@ class SizedTableEnv(BaseEnv):
     def get_language_instruction(self) -> list[str]:
         """One sentence per environment."""
         return [
-            instructions.render(self.task, self.slots(i), int(self._template[i]))
-            for i in range(self.num_envs)
+            self._variant.say(i, self.slots(i), int(self._template[i]), int(seed))
+            for i, seed in enumerate(self._episode_seed)
         ]
 
     def slots(self, i: int = 0) -> Slots:
         """Meaning of the instruction of environment `i`."""
-        words = [sizes.LABELS[label] for label in self._asked[i].tolist()]
-        return dict(zip(self.task.slots, words, strict=True))
+        asked = zip(self.task.blanks.items(), self._asked[i].tolist(), strict=True)
+        return {name: words[word] for (name, words), word in asked}
+
+    def ask(self, slots: Slots) -> None:
+        """Change what the instruction means, and nothing else.
+
+        Raises:
+            UsageError: the slots do not belong to the task.
+        """
+        instructions.check_slots(self.task, slots, self._split)
+        words = [known.index(slots[name]) for name, known in self.task.blanks.items()]
+        self._asked[:] = torch.tensor(words, device=self.device)
+        self._find_targets()
 
     def target_order(self, i: int = 0) -> tuple[int, ...]:
         """Indices of the named candidates of environment `i`, in the order named."""
@@ -152,6 +186,10 @@ class SizedTableEnv(BaseEnv):
         """Positions of the candidates of environment 0 now, in the base frame (m)."""
         return self._sensor.positions()[0].cpu().numpy() - self.base_in_world_m
 
+    def clutter_in_base(self) -> Float32[np.ndarray, "n 3"]:
+        """Positions of objects that are no candidates in environment 0 now, in the base frame."""
+        return self._variant.clutter_in_world() - self.base_in_world_m
+
     def tcp_in_base(self) -> Float[Tensor, "b 7"]:
         """Gripper pose: position (m) and quaternion wxyz in the base frame."""
         pose = self.agent.tcp_pose.raw_pose.clone()
@@ -163,10 +201,12 @@ class SizedTableEnv(BaseEnv):
 
         A function of the scene as it was reset, so that all can be asked for at once.
         """
-        return self._expert_keyframes(choice)[index]
+        if choice not in self._expert_plans:
+            self._expert_plans[choice] = self._expert_keyframes(choice)
+        return self._expert_plans[choice][index]
 
-    def expert_target(self, index: int) -> int:
-        """Position in `choice` of the candidate that keyframe `index` serves."""
+    def expert_target(self, index: int) -> int | None:
+        """Position in `choice` of the candidate that keyframe `index` serves, if it serves one."""
         return index * len(self.task.slots) // self.task.keyframes
 
     def outcome(self, i: int = 0) -> Outcome:
@@ -177,23 +217,21 @@ class SizedTableEnv(BaseEnv):
         return Outcome(
             success=bool(result["success_strict"][i]),
             success_lenient=bool(result["success_lenient"][i]),
-            asked=tuple(self.slots(i).values()),
+            asked=self.task.size_words(self.slots(i)),
             handled=tuple(names[k] for k in handled),
+            placed=tuple(names[k] for k in (self._receptacles()[i] >= 0).nonzero()[:, 0].tolist()),
             handled_indices=handled,
             touched=tuple(names[k] for k in _in_order(self.events.touch_order[i])),
             displaced=tuple(names[k] for k in self.events.displaced[i].nonzero()[:, 0].tolist()),
+            wrong_receptacle=self._wrong_receptacle(i),
+            robot_contact_n=max(self.contacts.forces_n.values(), default=0.0),
         )
 
     # ManiSkill's life cycle ----------------------------------------------------------------------
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        return SimConfig(
-            sim_freq=100,
-            control_freq=20,
-            scene_config=SceneConfig(solver_position_iterations=20, contact_offset=0.01),
-            default_materials_config=DefaultMaterialsConfig(0.5, 0.5, 0.0),
-        )
+        return simulation.sim_config()
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -201,8 +239,7 @@ class SizedTableEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at((0.55, 0.55, 0.55), (-0.1, 0.0, 0.1))
-        return CameraConfig("render_camera", pose, 512, 512, 0.9, 0.01, 100, shader_pack="default")
+        return simulation.spectator()
 
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -212,45 +249,41 @@ class SizedTableEnv(BaseEnv):
         Raises:
             UsageError: a seed or option does not belong to this task.
         """
-        seeds = [] if seed is None else np.atleast_1d(np.asarray(seed)).tolist()
-        for one in seeds:
-            scenes.partition_of(one)
+        seeds = [] if seed is None else np.atleast_1d(seed).tolist()
+        scenes.check_seeds(seeds, self.num_envs)
         self._check_options(options or {})
         gym.Env.reset(self, seed=seeds[0] if seeds else None)  # sets np_random
         return super().reset(seed, options)
 
     def _check_options(self, options: dict[str, Any]) -> None:
-        if "slots" in options:
-            instructions.check_slots(self.task, options["slots"])
-        if "template" in options:
-            instructions.check_template(self.task, options["template"])
-        if "split" in options:
-            split = find_name(options["split"], self.task.splits, f"split of {self.task.name}")
-            if split != self._split and not self._will_rebuild(options):
-                raise UsageError(
-                    f"this environment was built for the split {self._split}, but {split} came; "
-                    'add "reconfigure": True to the options.'
-                )
-
-    def _will_rebuild(self, options: dict[str, Any]) -> bool:
-        return self.reconfiguration_freq == 1 or options.get("reconfigure", False)
+        wording.check_names(options, self.RESET_OPTIONS)
+        due = self.reconfiguration_freq != 0 and self._reconfig_counter == 0
+        rebuild = due or options.get("reconfigure", False)
+        split = options.get("split", "canon" if rebuild else self._split)
+        wording.check_options(self.task, split, options)
+        if split != self._split and not rebuild:
+            raise UsageError(
+                f"this environment was built for the split {self._split}, but {split} came; "
+                'add "reconfigure": True to the options.'
+            )
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE_IN_WORLD_M))
+        if self.scene.can_render():
+            lighten(self.agent.robot)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")
         props.build_table(self.scene)
-        geometries = [scenes.draw_geometry(int(seed)) for seed in self._episode_seed]
-        sizes_m = np.stack(
-            [sizes.sizes_m(self.task.family, self._split, g.labels, g.jitter) for g in geometries]
-        )
+        self._variant = Variant(self.task, self._split, self._episode_seed)
+        sizes_m = self._variant.sizes_m
         self.candidates = [
-            self._build_batch(k, sizes_m[:, k], [g.rgb[k] for g in geometries])
+            self._build_batch(k, sizes_m[:, k], self._variant.rgb(k))
             for k in range(sizes.CANDIDATES)
         ]
         self._load_extras()
-        self._create_state(np.stack([g.labels for g in geometries]), sizes_m)
+        self._variant.build(self.scene)
+        self._create_state(self._variant.labels, sizes_m)
 
     def _build_batch(
         self, k: int, sizes_m: Float64[np.ndarray, "b"], rgbs: list[Float64[np.ndarray, "3"]]
@@ -270,26 +303,27 @@ class SizedTableEnv(BaseEnv):
         self._sizes_m = torch.as_tensor(sizes_m, device=self.device, dtype=torch.float32)
         self._yaw_rad = torch.zeros_like(self._sizes_m)
         self._asked = torch.zeros(
-            (self.num_envs, len(self.task.slots)), dtype=torch.int64, device=self.device
+            (self.num_envs, len(self.task.blanks)), dtype=torch.int64, device=self.device
         )
         self._template = torch.zeros((self.num_envs, 1), dtype=torch.int64, device=self.device)
         self.events = Events.create(self.num_envs, self.device)
         self._sensor = CandidateSensor(self.scene, self.agent, self.candidates, self._touchable())
+        self.contacts = ContactLog(self.scene, self.agent, self._touchable())
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
-        """Fixed, shadowless light: part of the benchmark's definition."""
-        self.scene.set_ambient_light([0.35, 0.35, 0.35])
-        self.scene.add_directional_light([-0.5, -0.35, -1.0], [0.9, 0.9, 0.9])
-        self.scene.add_directional_light([0.7, 0.6, -1.0], [0.5, 0.5, 0.5])
+        simulation.add_light(self.scene)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
+        env_idx = torch.as_tensor(env_idx, device=self.device)
         self.agent.reset(np.tile(HOME_QPOS, (len(env_idx), 1)))
         self.agent.robot.set_pose(sapien.Pose(BASE_IN_WORLD_M))
         seeds = [int(self._episode_seed[i]) for i in env_idx.tolist()]
         layouts = [scenes.draw_layout(self.task, seed) for seed in seeds]
-        self.events.restart(env_idx, self._place_candidates(env_idx, layouts))
-        self._place_extras(env_idx, layouts)
         self._say(env_idx, seeds, options)
+        self.events.restart(env_idx, self._place_candidates(env_idx, layouts))
+        self.contacts.restart()
+        self._place_extras(env_idx, layouts)
+        self._variant.place(env_idx, layouts, seeds)
 
     def _place_candidates(
         self, env_idx: Tensor, layouts: list[scenes.Layout]
@@ -297,10 +331,9 @@ class SizedTableEnv(BaseEnv):
         xy_m = self._to_tensor([layout.xy_m for layout in layouts])
         height_m = self._rest_height_m(self._sizes_m)[env_idx]
         position = torch.cat([xy_m, height_m[..., None]], dim=-1)
+        position[~self._present[env_idx]] += torch.tensor(AWAY_M, device=self.device)
         self._yaw_rad[env_idx] = self._to_tensor([layout.yaw_rad for layout in layouts])
-        half = self._yaw_rad[env_idx] / 2
-        nothing = torch.zeros_like(half)
-        quaternion = torch.stack([half.cos(), nothing, nothing, half.sin()], dim=-1)
+        quaternion = self._rest_quaternions(self._yaw_rad[env_idx])
         for k, candidate in enumerate(self.candidates):
             candidate.set_pose(Pose.create_from_pq(position[:, k], quaternion[:, k]))
         return position
@@ -308,15 +341,20 @@ class SizedTableEnv(BaseEnv):
     def _say(self, env_idx: Tensor, seeds: list[int], options: dict[str, Any]) -> None:
         """Choose the words: from the instruction stream, unless given."""
         for i, seed in zip(env_idx.tolist(), seeds, strict=True):
-            drawn, template = instructions.draw_words(self.task, scenes.stream(seed, "instruction"))
+            drawn, template = wording.draw_meaning(self.task, self._split, seed)
             words = options.get("slots", drawn)
-            asked = [sizes.LABELS.index(words[name]) for name in self.task.slots]
+            asked = [known.index(words[name]) for name, known in self.task.blanks.items()]
             self._asked[i] = torch.tensor(asked, device=self.device)
             self._template[i] = options.get("template", template)
         self._find_targets()
 
     def _after_control_step(self) -> None:
+        if self.scene.gpu_sim_enabled:
+            self.scene._gpu_fetch_all()  # noqa: SLF001 -- ManiSkill would, but after this
         self._update_events()
+
+    def _after_simulation_step(self) -> None:
+        self.contacts.look(self._handles)
 
     def _touch_and_carry(self) -> None:
         forces_n = self._sensor.forces_n()
@@ -350,13 +388,19 @@ class SizedTableEnv(BaseEnv):
             extra["candidate_pose"] = torch.cat(
                 [candidate.pose.raw_pose for candidate in self.candidates], dim=-1
             )
-            extra["candidate_size"] = self._sizes_m
-            extra["asked"] = self._asked
+            extra["candidate_size"] = self._sizes_m.clone()
+            extra["asked"] = self._asked.clone()
+            extra["handle_order"] = self.events.handle_order.clone()
         return extra
+
+    def get_sensor_params(self) -> dict[str, dict[str, Tensor]]:
+        """ManiSkill's, as copies: it hands out the same objects at every step."""
+        shared = super().get_sensor_params()
+        return {name: {k: v.clone() for k, v in it.items()} for name, it in shared.items()}
 
     def get_state_dict(self) -> dict[str, Any]:
         """Physics, plus the task's own state as ints and floats, each "b n"."""
-        task = {"asked": self._asked.clone(), "template": self._template.clone()}
+        task = {name: value.clone() for name, value in self._task_state().items()}
         return super().get_state_dict() | {"task": task | self.events.state()}
 
     def set_state_dict(self, state: dict[str, Any], env_idx: Tensor | None = None) -> None:
@@ -365,7 +409,7 @@ class SizedTableEnv(BaseEnv):
         if "task" in state:
             if env_idx is None:
                 env_idx = torch.arange(self.num_envs, device=self.device)
-            for name, own in (("asked", self._asked), ("template", self._template)):
+            for name, own in self._task_state().items():
                 saved = torch.as_tensor(state["task"][name], dtype=own.dtype, device=self.device)
                 own[env_idx] = saved.view(-1, own.shape[1])
             self.events.set_state(state["task"], env_idx)
@@ -373,25 +417,19 @@ class SizedTableEnv(BaseEnv):
 
     # Helpers -------------------------------------------------------------------------------------
 
-    @contextmanager
-    def _writing_state(self) -> Iterator[None]:
-        """Between two control steps: on the GPU, poses and targets are written in bulk."""
-        if self.gpu_sim_enabled:
-            self.scene._gpu_fetch_all()  # noqa: SLF001 -- as ManiSkill's own tasks do
-        yield
-        if self.gpu_sim_enabled:
-            self.scene._gpu_apply_all()  # noqa: SLF001
-            self.scene._gpu_fetch_all()  # noqa: SLF001
-
     def _to_tensor(self, rows: list[np.ndarray]) -> Float[Tensor, "n ..."]:
         """Stack rows drawn by numpy."""
         return torch.as_tensor(np.stack(rows), dtype=torch.float32, device=self.device)
 
     def _find_targets(self) -> None:
         """Resolve the words into candidates; called when words change."""
-        named = self._labels[:, None] == self._asked[..., None]
+        sizes_asked = self._asked[:, : len(self.task.slots)]
+        named = self._labels[:, None] == sizes_asked[..., None]
         self._targets = named.int().argmax(-1)
-        self._unnamed = ~named.any(1)
+        # They depend on the scene as it was reset and on the words, so they are forgotten here.
+        self._expert_plans: dict[tuple[int, ...], list[Keyframe]] = {}
+        self._present = self._variant.present(named.any(1))
+        self._unnamed = ~named.any(1) & self._present
 
     def _touchable(self) -> list[Actor | Link]:
         """The body of each candidate that fingers act on."""
@@ -406,34 +444,7 @@ class SizedTableEnv(BaseEnv):
         position = self.events.start[0, k].cpu().numpy().astype(np.float64)
         return position, float(self._yaw_rad[0, k])
 
-    def _downwards(
-        self,
-        xyz_in_world_m: np.ndarray,
-        yaw_rad: float,
-        *,
-        gripper_open: bool,
-        ignore_collisions: bool,
-    ) -> Keyframe:
-        """Keyframe with the gripper pointing down and its closing axis turned by `yaw_rad`."""
-        return Keyframe(
-            position_m=np.asarray(xyz_in_world_m, dtype=np.float64) - BASE_IN_WORLD_M,
-            quaternion_wxyz=np.array([0.0, np.cos(yaw_rad / 2), np.sin(yaw_rad / 2), 0.0]),
-            gripper_open=gripper_open,
-            ignore_collisions=ignore_collisions,
-        )
-
 
 def _in_order(order: Int[Tensor, "3"]) -> tuple[int, ...]:
     happened = [(rank, k) for k, rank in enumerate(order.tolist()) if rank > 0]
     return tuple(k for _, k in sorted(happened))
-
-
-@cache
-def _spare_imports_from_collection() -> None:
-    """Keep libraries out of garbage collection, once per process.
-
-    ManiSkill collects garbage at each rebuild, and walking through the modules of torch would take
-    most of a reset.
-    """
-    gc.collect()
-    gc.freeze()

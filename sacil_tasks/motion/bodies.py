@@ -7,6 +7,7 @@ from typing import TypeAlias
 import coal
 import numpy as np
 import pinocchio as pin
+from jaxtyping import Float64
 from mani_skill.envs.sapien_env import BaseEnv
 from sapien import Entity, physx
 
@@ -30,6 +31,9 @@ class Body:
     shapes: tuple[Placed, ...]
     movable: bool
     """Free to be picked up."""
+
+    slides_along: Float64[np.ndarray, "3"] | None
+    """Direction, in its own frame, in which it can be pulled."""
 
 
 def base_in_world(env: BaseEnv) -> pin.SE3:
@@ -69,7 +73,18 @@ def _read_body(component: physx.PhysxRigidBaseComponent) -> Body:
     movable = isinstance(component, physx.PhysxRigidDynamicComponent) and not component.kinematic
     shapes = component.collision_shapes
     placed = hull(shapes) if movable else [to_coal(shape) for shape in shapes]
-    return Body(component.entity.name, component.entity, tuple(placed), movable)
+    return Body(
+        component.entity.name, component.entity, tuple(placed), movable, _slides_along(component)
+    )
+
+
+def _slides_along(component: physx.PhysxRigidBaseComponent) -> Float64[np.ndarray, "3"] | None:
+    if not isinstance(component, physx.PhysxArticulationLinkComponent):
+        return None
+    joint = component.joint
+    if joint is None or joint.type != "prismatic":
+        return None
+    return to_se3(joint.pose_in_child).rotation[:, 0]  # PhysX joints slide along x
 
 
 def _within_reach(body: Body, pose: pin.SE3) -> bool:

@@ -57,6 +57,9 @@ class MotionState:
     held: int | None
     """Index of the body in the hand."""
 
+    pulled: int | None = None
+    """Index of the sliding body, a drawer, whose handle is in the hand."""
+
 
 @dataclass(frozen=True)
 class _Part:
@@ -145,6 +148,15 @@ class CollisionWorld:
 
     def body_between_fingers(self, state: MotionState) -> int | None:
         """The movable body that the fingers enclose, nearest to the tool centre first."""
+        movable = {index for index, body in enumerate(self.bodies) if body.movable}
+        return self._between_fingers(state, movable)
+
+    def drawer_between_fingers(self, state: MotionState) -> int | None:
+        """The sliding body that the fingers enclose, nearest to the tool centre first."""
+        sliding = {i for i, body in enumerate(self.bodies) if body.slides_along is not None}
+        return self._between_fingers(state, sliding)
+
+    def _between_fingers(self, state: MotionState, among: set[int]) -> int | None:
         if state.finger_m < EMPTY_M:
             return None
         tcp = self._arm.tcp_in_base(state.joints)
@@ -154,7 +166,7 @@ class CollisionWorld:
         gaps = {
             part.body: gap_m(center, placed)
             for part, placed in self._placed(state)
-            if self.bodies[part.body].movable and gap_m((bar, tcp), placed) <= 0
+            if part.body in among and gap_m((bar, tcp), placed) <= 0
         }
         return min(gaps, key=gaps.__getitem__, default=None)
 

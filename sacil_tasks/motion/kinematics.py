@@ -93,6 +93,11 @@ class PandaArm:
         pin.framesForwardKinematics(self.model, self.data, self._with_fingers(joints))
         return self.data.oMf[self._tcp].copy()
 
+    def inertia(self, joints: Joints) -> Float64[np.ndarray, "7 7"]:
+        """Torque (N m) per joint acceleration (rad/s^2) at these joints, fingers closed."""
+        upper = np.triu(pin.crba(self.model, self.data, self._with_fingers(joints)))
+        return (upper + np.triu(upper, 1).T)[:ARM_JOINTS, :ARM_JOINTS]
+
     def solve(
         self, target: pin.SE3, start: Joints, *, iterations: int | None = None
     ) -> Joints | None:

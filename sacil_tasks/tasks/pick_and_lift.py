@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.scenes import Layout
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
@@ -71,6 +72,12 @@ class PickAndLiftEnv(SizedTableEnv):
         goals_m = self._to_tensor([layout.goal_m for layout in layouts])
         self.goal.set_pose(Pose.create_from_pq(goals_m))
 
+    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
+        extra = super()._get_obs_extra(info)
+        if self.obs_mode_struct.use_state:
+            extra["goal_position"] = self.goal.pose.p
+        return extra
+
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
         gaps_m = (self._sensor.positions() - self.goal.pose.p[:, None]).norm(dim=-1)
         return self._pick((gaps_m <= GOAL_TOLERANCE_M) & self.events.grasped, targets)
@@ -78,12 +85,12 @@ class PickAndLiftEnv(SizedTableEnv):
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         edge_m, (at, yaw) = self.sizes_m[choice[0]], self._start_pose(choice[0])
         above = np.array([at[0], at[1], edge_m + 0.08])
-        grasp = np.array([at[0], at[1], max(edge_m / 2, 0.0115)])
+        grasp = np.array([at[0], at[1], grasp_height_m(edge_m)])
         lift = grasp + np.array([0, 0, 0.10])
         goal = self.goal.pose.p[0].cpu().numpy() + np.array([0, 0, grasp[2] - edge_m / 2])
         return [
-            self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
-            self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(goal, yaw, gripper_open=False, ignore_collisions=False),
+            downwards(above, yaw, gripper_open=True, ignore_collisions=False),
+            downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(goal, yaw, gripper_open=False, ignore_collisions=False),
         ]

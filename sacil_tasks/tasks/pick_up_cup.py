@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards, grasp_height_m
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
 
@@ -77,13 +78,12 @@ class PickUpCupEnv(SizedTableEnv):
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         height_m = props.cup_height_m(self.sizes_m[choice[0]])
         at, heading = self._start_pose(choice[0])
-        # Closing across the handle and on two flat facets of the wall; a half turn is the same.
-        yaw = np.pi / 2 - (np.pi / 2 - heading) % np.pi
-        grasp = np.array([at[0], at[1], max(height_m - 0.025, height_m / 2)])
+        yaw = props.cup_grasp_yaw(heading)
+        grasp = np.array([at[0], at[1], grasp_height_m(height_m)])
         above = np.array([at[0], at[1], height_m + 0.08])
         lift = grasp + np.array([0, 0, 0.20])
         return [
-            self._downwards(above, yaw, gripper_open=True, ignore_collisions=False),
-            self._downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
-            self._downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(above, yaw, gripper_open=True, ignore_collisions=False),
+            downwards(grasp, yaw, gripper_open=False, ignore_collisions=True),
+            downwards(lift, yaw, gripper_open=False, ignore_collisions=True),
         ]

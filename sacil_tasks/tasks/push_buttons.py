@@ -10,7 +10,9 @@ from torch import Tensor
 
 from sacil_tasks import props
 from sacil_tasks.interface import Keyframe
+from sacil_tasks.poses import downwards
 from sacil_tasks.scenes import Layout
+from sacil_tasks.simulation import writing_state
 from sacil_tasks.sizes import CANDIDATES
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.table import SizedTableEnv
@@ -79,7 +81,7 @@ class PushButtonsEnv(SizedTableEnv):
         self._touch_and_carry()
         travel_m = torch.cat([button.qpos for button in self.candidates], dim=-1)
         if self.events.handle(travel_m < PRESSED_M).any():
-            with self._writing_state():
+            with writing_state(self.scene):
                 self._show_pressed(torch.arange(self.num_envs, device=self.device))
 
     def _show_pressed(self, env_idx: Tensor) -> None:
@@ -99,8 +101,9 @@ class PushButtonsEnv(SizedTableEnv):
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         """Restore presses too: drive targets are not part of ManiSkill's state."""
         super().set_state_dict(state, env_idx)
-        with self._writing_state():
-            self._show_pressed(torch.arange(self.num_envs, device=self.device))
+        with writing_state(self.scene):
+            # During a reset ManiSkill writes to the environments being reset only.
+            self._show_pressed(self.scene._reset_mask.nonzero()[:, 0])  # noqa: SLF001
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         keyframes = []
@@ -108,8 +111,8 @@ class PushButtonsEnv(SizedTableEnv):
             (x, y, _), _ = self._start_pose(k)
             above, press = np.array([x, y, 0.10]), np.array([x, y, 0.0395])
             keyframes += [
-                self._downwards(above, 0.0, gripper_open=False, ignore_collisions=False),
-                self._downwards(press, 0.0, gripper_open=False, ignore_collisions=True),
-                self._downwards(above, 0.0, gripper_open=False, ignore_collisions=True),
+                downwards(above, 0.0, gripper_open=False, ignore_collisions=False),
+                downwards(press, 0.0, gripper_open=False, ignore_collisions=True),
+                downwards(above, 0.0, gripper_open=False, ignore_collisions=True),
             ]
         return keyframes

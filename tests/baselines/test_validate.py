@@ -9,8 +9,9 @@ from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet
 from baselines.text import SentenceTable, TextSpec, tidy
-from baselines.validate import REACH_M, grip_angle_deg, nearest, validate
+from baselines.validate import grip_angle_deg, validate
 from baselines.views import cube_from_base
+from sacil_tasks.aim import REACH_M, nearest
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,17 @@ def test_scores_are_split_by_task_and_size(loader):
 def test_reaching_for_a_neighbour_is_a_wrong_selection(loader):
     scores = validate(Cheat(loader, shift_m=(0.0, 0.2, 0.0)), loader)
     assert scores["all"]["position_mm"] == pytest.approx(200, abs=0.1)
-    assert scores["all"]["selected_by_words"] == (0, 3)
+    assert scores["all"]["selected_by_words"] == scores["all"]["selected_in_slot_1"] == (0, 3)
+
+
+def test_choices_are_counted_by_slot_and_size(loader):
+    scores = validate(Cheat(loader), loader)["all"]
+    assert scores["selected_in_slot_1"] == (3, 3)
+    assert scores["took_when_asked"] == {
+        "small": [1, 0, 0],
+        "medium": [0, 1, 0],
+        "large": [0, 0, 1],
+    }
 
 
 def test_reaching_is_judged_from_above_within_a_radius():

@@ -3,8 +3,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from leaderboard.protocol import EvalProtocol, protocol_of
-from sacil_tasks.catalog import task_names
+from leaderboard.protocol import UNRULED, EvalProtocol, protocol_name, protocol_of
+from sacil_tasks.catalog import task_names, task_spec
 
 PROTOCOL = protocol_of("pick_and_lift", "test", 0)
 
@@ -26,6 +26,19 @@ def test_tasks_partitions_and_scene_sets_have_hashes_of_their_own():
         for scene_set in (0, 1)
     ]
     assert len({protocol.hash for protocol in protocols}) == len(protocols)
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_splits_that_the_ladder_alone_defines_share_a_protocol(task):
+    supported = set(UNRULED) & set(task_spec(task).splits)
+    assert len({protocol_of(task, "test", 0, split).hash for split in supported}) == 1
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_other_splits_have_hashes_of_their_own(task):
+    names = {protocol_name(task, split) for split in task_spec(task).splits}
+    hashes = {protocol_of(task, "test", 0, split).hash for split in task_spec(task).splits}
+    assert len(hashes) == len(names)
 
 
 @pytest.mark.sim

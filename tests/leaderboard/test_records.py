@@ -1,3 +1,4 @@
+import json
 import os
 
 import pytest
@@ -12,6 +13,16 @@ def test_a_record_survives_its_line():
     line = record.to_json()
     assert "\n" not in line
     assert EpisodeRecord.from_json(line) == record
+
+
+def test_records_written_before_aims_were_noted_are_read():
+    record = make_records()[0]
+    content = json.loads(record.to_json())
+    assert content.pop("aimed") is None
+    assert EpisodeRecord.from_json(json.dumps(content)) == record
+    for spoilt in (content | {"unheard": 1}, {k: v for k, v in content.items() if k != "end"}):
+        with pytest.raises(ValueError, match=r"unheard|end"):
+            EpisodeRecord.from_json(json.dumps(spoilt))
 
 
 @pytest.mark.parametrize("cut", [1, 7, 100])

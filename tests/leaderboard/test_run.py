@@ -18,7 +18,10 @@ from sacil_tasks.errors import UsageError
         ({"tasks": ("pick_and_lft",)}, "Did you mean pick_and_lift"),
         ({"suite": "slise"}, "Did you mean slice"),
         ({"split": ("cannon",)}, "Did you mean canon"),
-        ({"split": ("shift_up",)}, "pick_up_cup has the splits canon, shift_down"),
+        (
+            {"tasks": ("pick_up_cup",), "split": ("canon", "shift_up")},
+            "pick_up_cup has no split shift_up: its largest size",
+        ),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"workers": 0}, "--workers must be at least 1"),
         ({"checkpoint": Path("no/such/folder")}, "no checkpoint at no/such/folder"),
@@ -28,6 +31,20 @@ def test_a_wrong_word_is_one_sentence_before_anything_starts(changes, sentence, 
     with pytest.raises(UsageError, match=sentence):
         Job.of(RunConfig(**{"agent": "oracle", "out": tmp_path / "run"} | changes))
     assert not (tmp_path / "run").exists()
+
+
+def test_under_a_suite_a_split_that_a_task_lacks_is_not_applicable(tmp_path):
+    config = RunConfig(agent="oracle", suite="single", split=("shift_up",), out=tmp_path)
+    job = Job.of(config)
+    tasks = {key.task for key in job.keys}
+    assert "pick_and_lift" in tasks
+    assert "pick_up_cup" not in tasks
+    assert any(line.startswith("n/a  pick_up_cup shift_up: its larg") for line in job.not_there)
+
+
+def test_a_group_of_splits_stands_for_its_members(tmp_path):
+    config = RunConfig(agent="oracle", tasks=("pick_and_lift",), split=("fine",), out=tmp_path)
+    assert len(Job.of(config).splits) == 6
 
 
 def test_the_default_folder_tells_agents_weights_and_scenes_apart():

@@ -130,7 +130,7 @@ def _pixels_by_label(env: SizedTableEnv, seed: int, split: str) -> np.ndarray:
 
 
 def test_sizes_can_be_told_apart_in_two_views_of_any_scene(env: SizedTableEnv) -> None:
-    for split in env.task.splits:
+    for split in {"canon", "shift_down", "shift_up"} & set(env.task.splits):
         for index in range(6):
             seed = scene_seed("val", 0, env.task.name, index, 0)
             counts = _pixels_by_label(env, seed, split)

@@ -9,8 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from scipy.spatial.transform import Rotation
 
 from sacil_tasks import sizes
@@ -19,6 +17,7 @@ from sacil_tasks.errors import UsageError
 from sacil_tasks.instructions import variations
 from sacil_tasks.interface import SCENE_BOUNDS
 from sacil_tasks.scenes import scene_seed
+from sacil_tasks.splits import SPLITS
 from sacil_tasks.table import HOME_QPOS, SizedTableEnv
 
 pytestmark = pytest.mark.sim
@@ -111,25 +110,66 @@ def test_words_change_nothing_but_words(env: SizedTableEnv) -> None:
         env.reset(seed=3, options={"slots": slots, "template": 0})
         assert env.slots() == slots
         named = [env.candidate_labels[k] for k in env.target_order()]
-        assert named == list(slots.values())
+        assert named == [slots[name] for name in env.task.slots]
         targets.add(env.target_order())
-    assert len(targets) == len(choices)
+    assert len(targets) == len({env.task.size_words(slots) for slots in choices})
 
 
-def test_splits_change_sizes_and_heights_only(env: SizedTableEnv) -> None:
+def test_splits_move_no_candidate_and_change_no_order_of_sizes(env: SizedTableEnv) -> None:
     _state(env, 5)
-    canon, place = env.sizes_m, env.candidate_in_base()
+    canon_m, place = env.sizes_m, env.candidate_in_base()
     for split in env.task.splits:
         env.reset(seed=5, options={"split": split})
-        steps = sizes.FIRST_RUNG[split] - sizes.FIRST_RUNG["canon"]
-        assert np.all(np.sign(env.sizes_m - canon) == np.sign(steps))
-        assert np.array_equal(env.candidate_in_base()[:, :2], place[:, :2])
-        assert np.argsort(env.sizes_m).tolist() == np.argsort(canon).tolist()
+        there = env.candidate_in_base()[:, 2] > -1
+        assert np.array_equal(env.candidate_in_base()[there, :2], place[there, :2])
+        assert np.argsort(env.sizes_m).tolist() == np.argsort(canon_m).tolist()
+        if split.startswith("shift"):
+            assert np.all(np.sign(env.sizes_m - canon_m) == (1 if split == "shift_up" else -1))
+        elif SPLITS[split].ratio is None and split != "mixed":
+            assert np.array_equal(env.sizes_m, canon_m)
+
+
+def test_objects_left_out_are_out_of_reach_and_never_count(env: SizedTableEnv) -> None:
+    for split in {"pair", "single_object"} & set(env.task.splits):
+        env.reset(seed=5, options={"split": split})
+        there = env.candidate_in_base()[:, 2] > -1
+        assert there.sum() == (2 if split == "pair" else 1)
+        assert all(there[k] for k in env.target_order())
+        info = _hold(env, 40)
+        assert not info["success_lenient"].any()
+        assert not (env.events.displaced & env._unnamed).any()  # noqa: SLF001
+
+
+def test_clutter_is_of_another_kind_and_stands_clear(env: SizedTableEnv) -> None:
+    if "clutter" not in env.task.splits:
+        pytest.skip(f"{env.task.name} has no clutter")
+    for seed in range(4):
+        env.reset(seed=seed, options={"split": "clutter"})
+        before = env.clutter_in_base()
+        gaps_m = np.linalg.norm(before[:, :2] - env.candidate_in_base()[:, :2], axis=-1)
+        assert gaps_m.min() > 0.1
+        _hold(env, 20)
+        assert np.abs(env.clutter_in_base() - before).max() < 1e-3
+    env.reset(seed=0)
+    assert not len(env.clutter_in_base())
+
+
+def test_every_split_says_what_the_registry_says(env: SizedTableEnv) -> None:
+    words = {}
+    for split in env.task.splits:
+        env.reset(seed=5, options={"split": split})
+        (words[split],) = env.get_language_instruction()
+    assert words["blank_text"] == ""
+    assert words["canon"] == words["shift_down"] == words["fine_110"] == words["clutter"]
+    assert "er " in words["pair"]
+    assert not set(words["unique_colour"].split()) & set(sizes.LABELS)
+    held_out = {words["para_size"], words["para_verb"], words["para_both"]}
+    assert len(held_out | {words["canon"]}) == 4
 
 
 def test_unsupported_splits_and_options_are_refused(env: SizedTableEnv) -> None:
-    for split in set(sizes.SPLITS) - set(env.task.splits):
-        with pytest.raises(UsageError, match=f"no split of {env.task.name}"):
+    for split in set(SPLITS) - set(env.task.splits):
+        with pytest.raises(UsageError, match=f"{env.task.name} has no split {split}"):
             env.reset(seed=1, options={"split": split})
     for options in ({"split": "shift_dwon"}, {"slots": {"size": "tiny"}}, {"template": 99}):
         with pytest.raises(UsageError):
@@ -208,19 +248,28 @@ def test_order_of_presses_decides(buttons: SizedTableEnv) -> None:
     assert buttons.outcome().code == "SIZE_CONFUSION"
 
 
-def test_expert_keyframes_point_down_inside_the_scene_bounds(env: SizedTableEnv) -> None:
-    env.reset(seed=13)
+def test_expert_keyframes_stay_inside_the_scene_bounds(env: SizedTableEnv) -> None:
     low = np.subtract(SCENE_BOUNDS.center_in_base, SCENE_BOUNDS.side_m / 2)
-    for index in range(env.task.keyframes):
+    for seed in range(30):
+        env.reset(seed=seed)
+        for index in range(env.task.keyframes):
+            keyframe = env.expert_keyframe(index, env.target_order())
+            assert np.all(keyframe.position_m > low)
+            assert np.all(keyframe.position_m < low + SCENE_BOUNDS.side_m)
+
+
+def test_the_expert_turns_to_one_candidate_after_the_other_from_above(env: SizedTableEnv) -> None:
+    env.reset(seed=13)
+    served = [env.expert_target(index) for index in range(env.task.keyframes)]
+    first_of = [served.index(position) for position in range(len(env.task.slots))]
+    assert set(served[: first_of[0]]) <= {None}
+    assert served[first_of[0] :] == sorted(served[first_of[0] :], key=lambda target: target or 0)
+    for position, index in enumerate(first_of):
         keyframe = env.expert_keyframe(index, env.target_order())
         approach = Rotation.from_quat(keyframe.quaternion_wxyz, scalar_first=True).apply([0, 0, 1])
         assert approach == pytest.approx([0, 0, -1])
-        assert np.all(keyframe.position_m > low)
-        assert np.all(keyframe.position_m < low + SCENE_BOUNDS.side_m)
-        target = env.target_order()[env.expert_target(index)]
-        if index < 2:
-            gap = keyframe.position_m[:2] - env.candidate_in_base()[target, :2]
-            assert np.abs(gap).max() < 1e-6
+        gap = keyframe.position_m[:2] - env.candidate_in_base()[env.target_order()[position], :2]
+        assert np.abs(gap).max() < 1e-6
 
 
 def test_the_gripper_starts_high_and_vertical(env: SizedTableEnv) -> None:
@@ -233,12 +282,6 @@ def test_the_gripper_starts_high_and_vertical(env: SizedTableEnv) -> None:
 def test_specs_read_from_source_are_those_of_the_classes(task: str) -> None:
     assert load_task(task).task == task_spec(task)
     assert task_spec(task).name == task
-
-
-def test_gymnasium_accepts_the_environment() -> None:
-    made = gym.make(env_id("pick_and_lift"), obs_mode="state", render_backend="none")
-    check_env(CPUGymWrapper(made.unwrapped), skip_render_check=True, skip_close_check=True)
-    made.close()
 
 
 def test_ids_work_in_a_fresh_process_and_load_lazily() -> None:

@@ -44,11 +44,14 @@ def test_the_expert_succeeds_in_every_variation_of_a_scene(task):
     from sacil_tasks.instructions import variations
 
     stage = Stage(task, render=False)
-    for variation in range(len(variations(task_spec(task)))):
+    count = len(variations(task_spec(task)))
+    for variation in range(0, count, 1 if count <= 6 else 5):  # of many, each word at least once
         begin(stage, 0, variation=variation)
         results = play_expert(stage)
         assert results[-1].success, stage.outcome()
         assert stage.outcome().code == "SUCCESS"
+        # Fingers that close on a small block may brush the table; nothing else may be touched.
+        assert all("table" in thing for _, thing in stage.env.contacts.forces_n)
         assert all(result.refusal is None for result in results)
     stage.close()
 

@@ -16,8 +16,11 @@ TASKS = task_names()
 def test_every_ordered_choice_of_labels_is_a_variation(task: str) -> None:
     spec = task_spec(task)
     choices = instructions.variations(spec)
-    assert len(choices) == {1: 3, 2: 6}[len(spec.slots)]
+    assert len(choices) == {1: 3, 2: 6}[len(spec.slots)] * 3 ** len(spec.receptacles)
     assert len({tuple(slots.values()) for slots in choices}) == len(choices)
+    for slots in choices:
+        assert len(set(spec.size_words(slots))) == len(spec.slots)
+        assert all(slots[name] in words for name, words in spec.blanks.items())
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -65,8 +68,16 @@ def test_wrong_slots_are_explained(slots: dict, message: str) -> None:
         instructions.check_slots(task_spec("pick_and_lift"), slots)
 
 
+def test_a_wrong_drawer_is_explained() -> None:
+    spec = task_spec("put_item_in_drawer")
+    with pytest.raises(UsageError, match="Did you mean bottom"):
+        instructions.check_slots(spec, {"size": "small", "drawer": "botom"})
+    with pytest.raises(UsageError, match="choose one of"):
+        instructions.check_slots(spec, {"size": "small"})
+
+
 def test_one_word_for_two_slots_is_refused() -> None:
-    with pytest.raises(UsageError, match="another size word"):
+    with pytest.raises(UsageError, match="each size with another word"):
         instructions.check_slots(task_spec("push_buttons"), {"first": "small", "second": "small"})
 
 

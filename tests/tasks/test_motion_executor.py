@@ -129,7 +129,16 @@ def test_arm_follows_the_plan_without_lag(open_table):
     assert isinstance(plan, Plan)
     assert executor.execute(target) is None
     followed = np.array(watch.joints)[: len(plan.motion)]
-    np.testing.assert_allclose(followed, plan.motion, atol=0.03)
+    np.testing.assert_allclose(followed, plan.motion, atol=0.01)
+
+
+def test_descent_does_not_dip_below_its_end(open_table):
+    watch = Watch(open_table)
+    executor = begin(watch)
+    low = keyframe((0.5, 0.1, 0.0165))
+    assert executor.execute(keyframe((0.5, 0.1, 0.11))) is None
+    assert executor.execute(low) is None
+    assert min(watch.heights_m) == pytest.approx(low.position_m[2], abs=1e-3)
 
 
 def test_hand_that_touches_the_wall_may_leave_it(walled):

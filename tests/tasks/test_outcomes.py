@@ -7,13 +7,16 @@ from sacil_tasks.outcomes import OUTCOMES, Outcome
 INDEX = {"small": 2, "medium": 0, "large": 1}
 
 
-def _outcome(asked: str, handled: str = "", touched: str = "", **flags: bool) -> Outcome:
+def _outcome(
+    asked: str, handled: str = "", touched: str = "", *, placed: str = "", **flags: bool
+) -> Outcome:
     done = tuple(handled.split())
     return Outcome(
         success=flags.get("success", False),
         success_lenient=flags.get("success_lenient", False),
         asked=tuple(asked.split()),
         handled=done,
+        placed=tuple(placed.split()),
         handled_indices=tuple(INDEX[label] for label in done),
         touched=tuple(touched.split()),
         displaced=(),
@@ -32,6 +35,7 @@ def _outcome(asked: str, handled: str = "", touched: str = "", **flags: bool) ->
         (_outcome("small large", "large small"), "ORDER_ERROR"),
         (_outcome("small", "small", wrong_receptacle=True), "RECEPTACLE_ERROR"),
         (_outcome("small", "small", "small"), "MOTOR_FAIL"),
+        (_outcome("small", "small", placed="large"), "SIZE_CONFUSION"),
         (_outcome("small large", "small"), "MOTOR_FAIL"),
         (_outcome("small", touched="large"), "MOTOR_FAIL"),
         (_outcome("small"), "NO_INTERACTION"),

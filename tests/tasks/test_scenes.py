@@ -67,8 +67,24 @@ def test_layouts_keep_their_distance_and_region(task: str) -> None:
     gaps = np.linalg.norm(xy_m - np.roll(xy_m, 1, axis=1), axis=-1)
     low, high = np.transpose(scenes.REGION_M)
     assert gaps.min() >= spec.spacing_m
-    assert np.all((xy_m >= low) & (xy_m <= high))
+    assert np.all((xy_m >= low - 0.07) & (xy_m <= high + 0.07))
+    if spec.fixture is None or not spec.fixture.spots_m:
+        low, high = np.transpose(spec.region_m)
+        assert np.all((xy_m >= low) & (xy_m <= high))
     assert np.abs(yaw_rad).max() <= np.deg2rad(spec.yaw_limit_deg)
+
+
+@pytest.mark.parametrize("task", [t for t in task_names() if task_spec(t).fixture])
+def test_candidates_stand_on_every_spot_of_their_fixture(task: str) -> None:
+    spec = task_spec(task)
+    for seed in range(50):
+        layout = scenes.draw_layout(spec, seed)
+        assert np.abs(layout.fixture[:2] - spec.fixture.xy_m).max() <= spec.fixture.shift_m
+        if spec.fixture.spots_m:
+            spots = scenes.in_world(layout.fixture, np.array(spec.fixture.spots_m))
+            gaps = np.linalg.norm(layout.xy_m[:, None] - spots, axis=-1)
+            assert sorted(gaps.argmin(axis=1)) == [0, 1, 2]
+            assert gaps.min(axis=1).max() <= np.sqrt(2) * spec.fixture.spot_shift_m
 
 
 @pytest.mark.parametrize("task", task_names())

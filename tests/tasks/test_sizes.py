@@ -7,11 +7,14 @@ import pytest
 
 from sacil_tasks import sizes
 from sacil_tasks.sizes import FAMILIES, LABELS
+from sacil_tasks.splits import FINE_RATIOS
 
 EXTREMES = (0.96 * 0.98, 1.04 * 1.02)
 """Smallest and largest jitter."""
 
-SUPPORTED = [(name, split) for name, family in FAMILIES.items() for split in family.splits]
+FIRST_RUNGS = [
+    (name, first) for name, family in FAMILIES.items() for first in family.first_rungs((0, 1, 2))
+]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -20,28 +23,36 @@ def test_ladders_are_geometric(family: str) -> None:
     assert np.allclose(ratios, ratios.mean(), rtol=0.03)
 
 
-@pytest.mark.parametrize(("family", "split"), SUPPORTED)
-def test_rank_survives_any_jitter(family: str, split: str) -> None:
+@pytest.mark.parametrize(("family", "first"), FIRST_RUNGS)
+def test_rank_survives_any_jitter(family: str, first: int) -> None:
     labels = np.arange(3)
     for pair in itertools.product(EXTREMES, repeat=3):
-        drawn = sizes.sizes_m(family, split, labels, np.array(pair))
+        drawn = sizes.sizes_m(family, first, labels, np.array(pair))
         assert np.all(np.diff(drawn) > 0)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_shifted_sizes_mislead_whoever_learnt_absolute_sizes(family: str) -> None:
+@pytest.mark.parametrize("ratio", FINE_RATIOS)
+def test_a_ratio_is_exact_whatever_the_jitter(family: str, ratio: float) -> None:
+    jitter = sizes.draw_jitter(np.random.default_rng(0))
+    drawn = sizes.spread_m(family, ratio, np.array([2, 0, 1]), jitter)
+    assert drawn[[2, 0]] / drawn[[1, 2]] == pytest.approx([ratio, ratio])
+    assert drawn.max() <= sizes.largest_m(FAMILIES[family], ratio)
+
+
+@pytest.mark.parametrize(("family", "first"), FIRST_RUNGS)
+def test_shifted_sizes_mislead_whoever_learnt_absolute_sizes(family: str, first: int) -> None:
     """The nearest object to a word's training size is the named one in a third of cases."""
-    labels, ones = np.arange(3), np.ones(3)
-    trained = sizes.sizes_m(family, "canon", labels, ones)
-    for split in FAMILIES[family].splits:
-        shown = sizes.sizes_m(family, split, labels, ones)
-        picks = np.abs(np.log(shown[None] / trained[:, None])).argmin(axis=1)
-        assert np.mean(picks == labels) == (1.0 if split == "canon" else pytest.approx(1 / 3))
+    for corner in itertools.product(EXTREMES, repeat=3):
+        shown = sizes.sizes_m(family, first, np.arange(3), np.array(corner))
+        picks = [sizes.absolute_choice(family, label, shown) for label in LABELS]
+        assert picks == {0: [1, 2, 2], 1: [0, 1, 2], 2: [0, 0, 1]}[first]
 
 
-def test_cups_fit_the_open_gripper() -> None:
-    assert max(FAMILIES["cup"].rungs_m) * EXTREMES[1] < 0.08
-    assert "shift_up" not in FAMILIES["cup"].splits
+def test_what_is_grasped_fits_the_open_gripper() -> None:
+    for name in set(FAMILIES) - {"button"}:
+        assert max(FAMILIES[name].rungs_m) * EXTREMES[1] < sizes.GRASPABLE_M
+    assert FAMILIES["cup"].first_rungs((0, 1, 2)) == (0, 1)
 
 
 def test_jitter_is_mostly_common_to_the_scene() -> None:
