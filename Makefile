@@ -6,7 +6,7 @@ AGENT ?= sacil
 export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup leaderboard test demos train doctor clean
+.PHONY: help setup leaderboard test demos train cards doctor clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,12 +24,15 @@ test: setup ## style, types and all tests
 	@$(PYTHON) -m mypy
 	@$(PYTHON) -m pytest --numprocesses $(WORKERS) --dist loadfile
 
-demos: setup ## 100 expert demonstrations a task, and 36 for validation, into data/
-	@$(PYTHON) -m sacil_tasks.gen_demos --suite slice --demos 100 --workers $(WORKERS)
-	@$(PYTHON) -m sacil_tasks.gen_demos --suite slice --demos 36 --partition val --workers $(WORKERS)
+demos: setup ## 100 expert demonstrations of each of the nine tasks, and 36 for validation, into data/
+	@$(PYTHON) -m sacil_tasks.gen_demos --suite all --demos 100 --workers $(WORKERS)
+	@$(PYTHON) -m sacil_tasks.gen_demos --suite all --demos 36 --partition val --workers $(WORKERS)
 
 train: setup ## train AGENT (sacil) on data/, cpu preset
 	@$(PYTHON) -m baselines.train --agent $(AGENT) --suite slice
+
+cards: setup ## docs/tasks/ and the README's pictures, after a change to a task
+	@$(PYTHON) -m sacil_tasks.cards
 
 doctor: setup ## is this machine able, and what to do if not
 	@$(PYTHON) -m sacil_tasks.doctor

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from leaderboard.records import EPISODES_FILE
+from leaderboard.training import Training
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import package_version, write_json
 
@@ -43,6 +44,8 @@ class Manifest:
     """Run folders beside this one, itself included, that hold test episodes of these weights on
     any of the same splits. More than 1 means that the test was not touched once only."""
     splits: Sequence[str] = ()
+    training: Training | None = None
+    """What is behind the weights; None if they do not say, and in older manifests."""
 
     kind: str = KIND
     schema_version: int = SCHEMA_VERSION
@@ -54,6 +57,7 @@ class Manifest:
             protocols={**self.protocols, **later.protocols},
             commands=[*self.commands, *later.commands],
             splits=sorted({*self.splits, *later.splits}),
+            training=later.training or self.training,
         )
 
 
@@ -69,7 +73,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         if log.exists() and log.stat().st_size:
             raise UsageError(
                 f"{log} has no {MANIFEST_FILE} beside it, so it is not a run of ours. "
-                "Choose another folder with --out."
+                "Move it away, or choose another folder."
             )
         return None
     try:
@@ -77,7 +81,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(
             f"{path} is not the manifest of an evaluation ({error}). "
-            "Move the folder away or choose another with --out."
+            "Move the folder away, or choose another."
         ) from error
 
 
@@ -141,7 +145,11 @@ def _parse(path: Path) -> Manifest:
     content = json.loads(path.read_text(encoding="utf-8"))
     if (content["kind"], content["schema_version"]) != (KIND, SCHEMA_VERSION):
         raise ValueError(f"kind and schema_version are not {KIND} and {SCHEMA_VERSION}")
-    return Manifest(**{field.name: content[field.name] for field in fields(Manifest)})
+    facts = content.pop("training", None)
+    content = {
+        field.name: content[field.name] for field in fields(Manifest) if field.name in content
+    }
+    return Manifest(**content, training=None if facts is None else Training.of(facts))
 
 
 def _read_or_none(path: Path) -> Manifest | None:

@@ -223,7 +223,7 @@ def _parse(path: Path, number: int, line: str) -> EpisodeRecord:
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(
             f"{path} line {number} is not an episode record of schema {SCHEMA_VERSION} ({error}). "
-            "The file is damaged or foreign: move it away, or choose another folder with --out."
+            "The file is damaged or foreign: move it away, or choose another folder."
         ) from error
 
 

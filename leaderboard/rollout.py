@@ -7,11 +7,11 @@ out of reach or in collision is an invalid action. Both count as failures.
 import hashlib
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import sapien
@@ -51,6 +51,16 @@ class _Course:
     inference_s: float = 0.0
 
 
+class Witness(Protocol):
+    """Sees an episode as it is played; changes nothing."""
+
+    def begun(self, stage: Stage) -> None:
+        """The scene stands."""
+
+    def moved(self, stage: Stage, keyframe: Keyframe, refusal: str | None) -> None:
+        """A keyframe was executed, or refused."""
+
+
 class SceneRunner:
     """Plays scene after scene with one agent; keeps a stage while its task lasts."""
 
@@ -86,7 +96,11 @@ class SceneRunner:
 
 
 def run_episode(
-    stage: Stage, policy: Policy | Probe, entry: Entry, key: EpisodeKey
+    stage: Stage,
+    policy: Policy | Probe,
+    entry: Entry,
+    key: EpisodeKey,
+    witness: Witness | None = None,
 ) -> EpisodeRecord:
     """Play one episode; an exception on the way becomes part of the record.
 
@@ -97,8 +111,12 @@ def run_episode(
     course, facts = _Course(), dict[str, Any]()
     try:
         facts |= _set(stage, key)
+        if witness is not None:
+            witness.begun(stage)
         memory = _begin(stage, policy, entry, key, facts["instruction"])
-        _play(stage, policy, memory, course, privileged=entry.privileged)
+        for keyframe in _play(stage, policy, memory, course, privileged=entry.privileged):
+            if witness is not None:
+                witness.moved(stage, keyframe, course.reason or None)
         facts |= _judge(stage)
     except UsageError:
         raise
@@ -149,8 +167,9 @@ def _begin(
 
 def _play(
     stage: Stage, policy: Policy | Probe, memory: Memory, course: _Course, *, privileged: bool
-) -> None:
-    """Keyframe after keyframe, until the first lenient success, a refusal or the limit."""
+) -> Iterator[Keyframe]:
+    """Yield keyframe after keyframe, each when it has been executed or refused, until the first
+    lenient success, a refusal or the limit."""
     for _ in range(MAX_KEYFRAMES):
         if privileged:
             move = cast(Probe, policy).act_on(stage, memory)
@@ -163,11 +182,14 @@ def _play(
         result = stage.execute(keyframe)
         if result.refusal is not None:
             course.end, course.reason = INVALID_ACTION, result.refusal
+            yield keyframe
             return
         course.keyframes += 1
         course.success, course.success_lenient = result.success, result.success_lenient
         if result.success_lenient:
             course.end = SUCCEEDED
+        yield keyframe
+        if result.success_lenient:
             return
 
 

@@ -27,6 +27,7 @@ from leaderboard.plan import SceneJob, plan_episodes, scene_jobs, whole_scenes
 from leaderboard.protocol import EvalProtocol, protocol_name, protocol_of
 from leaderboard.records import EpisodeKey, EpisodeLog, EpisodeRecord, doubts
 from leaderboard.summary import console_table, write_summary
+from leaderboard.training import Training
 from leaderboard.worker import Choice, Look, Player
 from sacil_tasks.catalog import suite_tasks, task_spec
 from sacil_tasks.errors import UsageError, run_command
@@ -157,7 +158,7 @@ def main(config: RunConfig) -> None:
         checkpoint=look.checkpoint,
         protocols={name: protocol.hash for name, protocol in job.protocols.items()},
     )
-    ours = _manifest(config, job, entry)
+    ours = _manifest(config, job, entry, look.training)
     theirs = manifests.read_manifest(job.folder)
     if theirs is not None:
         manifests.check_same_run(job.folder, ours, theirs)
@@ -204,7 +205,9 @@ def _look(job: Job) -> Look:
     return cast(Look, look)
 
 
-def _manifest(config: RunConfig, job: Job, entry: Entry) -> manifests.Manifest:
+def _manifest(
+    config: RunConfig, job: Job, entry: Entry, training: Training | None
+) -> manifests.Manifest:
     ours = manifests.Manifest(
         agent=entry.agent,
         privileged=entry.privileged,
@@ -215,6 +218,7 @@ def _manifest(config: RunConfig, job: Job, entry: Entry) -> manifests.Manifest:
         protocols={name: protocol.described() for name, protocol in job.protocols.items()},
         commands=[command_line(config)],
         versions=manifests.installed_versions(),
+        training=training,
     )
     return manifests.counted(job.folder, ours)
 

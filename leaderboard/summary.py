@@ -84,18 +84,24 @@ def row(cell: Cell) -> dict[str, str | int]:
 
 
 def write_summary(path: Path, records: Iterable[EpisodeRecord]) -> None:
-    r"""Write the CSV atomically, lines ending in `\n`.
+    """Write the CSV atomically.
 
     Raises:
         UsageError: the file cannot be written.
     """
+    text = summary_text(records)
+    with atomic_path(path) as draft:
+        draft.write_text(text, encoding="utf-8", newline="")
+
+
+def summary_text(records: Iterable[EpisodeRecord]) -> str:
+    r"""The CSV, lines ending in `\n`."""
     rows = [row(cell) for cell in cells(records)]
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_path(path) as draft:
-        draft.write_text(text.getvalue(), encoding="utf-8", newline="")
+    return text.getvalue()
 
 
 def console_table(records: Iterable[EpisodeRecord]) -> str:

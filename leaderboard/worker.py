@@ -13,6 +13,7 @@ from leaderboard.agents import AgentRef
 from leaderboard.entry import Entry
 from leaderboard.plan import SceneJob
 from leaderboard.records import EpisodeRecord
+from leaderboard.training import Training, training_behind
 from sacil_tasks.files import content_hash, file_sha256
 
 
@@ -31,6 +32,7 @@ class Look:
 
     privileged: bool
     checkpoint: str | None
+    training: Training | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,11 @@ def look_at(choice: Choice) -> Look:
     weights = getattr(policy, "checkpoint_sha256", None)
     if weights is None and choice.checkpoint is not None:
         weights = hash_of(choice.checkpoint)
-    return Look(privileged=bool(getattr(policy, "privileged", False)), checkpoint=weights)
+    return Look(
+        privileged=bool(getattr(policy, "privileged", False)),
+        checkpoint=weights,
+        training=training_behind(choice.checkpoint, weights),
+    )
 
 
 def hash_of(checkpoint: Path) -> str:

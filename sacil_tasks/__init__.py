@@ -4,7 +4,7 @@ Importing this package registers the gymnasium ids (`gym.make("sacil_tasks:Sized
 torch and ManiSkill are imported when an environment is made.
 """
 
-from gymnasium.envs.registration import WrapperSpec, register
+from gymnasium.envs.registration import WrapperSpec, register, registry
 
 from sacil_tasks.catalog import MAX_EPISODE_STEPS, entry_point, env_id, task_names
 
@@ -22,3 +22,5 @@ for _task in task_names():
             ),
         ),
     )
+    # Recordings name it, and whoever replays them in another process must import this package.
+    registry[env_id(_task)].id = f"{__name__}:{env_id(_task)}"

@@ -56,12 +56,29 @@ def task_spec(task: str) -> TaskSpec:
     Raises:
         UsageError: there is no such task.
     """
-    path = _FOLDER / f"{find_name(task, task_names(), 'task')}.py"
-    for node in ast.parse(path.read_text()).body:
+    for node in _source(task).body:
         match node:
             case ast.Assign(targets=[ast.Name(id="SPEC")], value=ast.Call(keywords=keywords)):
                 return TaskSpec(**{str(key.arg): _literal(key.value) for key in keywords})
-    raise LookupError(f"{path.name} has no `SPEC = TaskSpec(...)` with literal arguments")
+    raise LookupError(f"{task}.py has no `SPEC = TaskSpec(...)` with literal arguments")
+
+
+def task_docstrings(task: str) -> tuple[str, str]:
+    """Docstrings of a task's file and of its environment class, read without importing them.
+
+    Raises:
+        UsageError: there is no such task.
+    """
+    module, name = _source(task), f"{_camel(task)}Env"
+    for node in module.body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return ast.get_docstring(module) or "", ast.get_docstring(node) or ""
+    raise LookupError(f"{task}.py has no class {name}")
+
+
+def _source(task: str) -> ast.Module:
+    path = _FOLDER / f"{find_name(task, task_names(), 'task')}.py"
+    return ast.parse(path.read_text())
 
 
 def _literal(node: ast.expr) -> Any:

@@ -18,7 +18,7 @@ def find_name(name: str, known: Iterable[str], kind: str) -> str:
     names = sorted(known)
     if name in names:
         return name
-    near = difflib.get_close_matches(name, names, n=2)
+    near = difflib.get_close_matches(str(name), names, n=2)
     hint = f" Did you mean {' or '.join(near)}?" if near else ""
     raise UsageError(f"no {kind} called '{name}'.{hint} Known: {', '.join(names) or 'none'}.")
 

@@ -50,7 +50,7 @@ class GenConfig:
     tasks: tuple[str, ...] = ()
     """Tasks by name; they override the suite."""
 
-    suite: str = "slice"
+    suite: str = "all"
     """A group of tasks: slice, single, dual or all."""
 
     demos: int = 100

@@ -6,6 +6,7 @@ and its position the same number.
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,16 +105,30 @@ def scene_seed(partition: str, scene_set: int, task: str, index: int, attempt: i
     return first + (int.from_bytes(key) + index * ATTEMPTS + attempt) % count
 
 
-def partition_of(seed: int) -> str:
+def partition_of(seed: object) -> str:
     """Partition a seed belongs to. Small seeds, as people type them, are `train`.
 
     Raises:
         UsageError: the seed has more than 32 bits or is negative.
     """
     for partition, (first, count) in _RANGES.items():
-        if first <= seed < first + count:
+        if isinstance(seed, int | np.integer) and first <= seed < first + count:
             return partition
-    raise UsageError(f"a seed is an integer from 0 to {2**SEED_BITS - 1}, but {seed} came.")
+    raise UsageError(f"a seed is an integer from 0 to {2**SEED_BITS - 1}, but {seed!r} came.")
+
+
+def check_seeds(seeds: Sequence[object], environments: int) -> None:
+    """Accept the seeds of a reset: none, one for all, or one for each environment.
+
+    Raises:
+        UsageError: there are too few or too many, or one is no seed.
+    """
+    if len(seeds) not in {0, 1, environments}:
+        raise UsageError(
+            f"{environments} environment(s) take one seed, or one each, but {len(seeds)} came."
+        )
+    for seed in seeds:
+        partition_of(seed)
 
 
 def stream(seed: int, tag: str) -> np.random.Generator:

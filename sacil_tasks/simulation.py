@@ -5,10 +5,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
+import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+
+from sacil_tasks.errors import UsageError
+
+
+def check_parallel(num_envs: int, sim_backend: str) -> None:
+    """Accept a number of environments in one process.
+
+    Raises:
+        UsageError: there are several, but no GPU to simulate them on.
+    """
+    if num_envs > 1 and (sim_backend in {"cpu", "physx_cpu"} or not torch.cuda.is_available()):
+        raise UsageError(
+            f"num_envs={num_envs} needs physics on an NVIDIA GPU, but sim_backend='{sim_backend}' "
+            "means the CPU here; make one environment per process, for example with gymnasium's "
+            "AsyncVectorEnv."
+        )
 
 
 def sim_config() -> SimConfig:

@@ -31,8 +31,10 @@ _OWN_JITTER = (0.98, 1.02)
 class SizeFamily:
     """One ladder of sizes in metres, smallest first."""
 
+    measure: str
+    """What of the object is as long as its size says."""
+
     rungs_m: tuple[float, ...]
-    """Edge of a block, outer diameter of a cup, width of a pepper, cap diameter of a button."""
 
     def first_rungs(self, wanted: Sequence[int]) -> tuple[int, ...]:
         """Those of `wanted` from which three rungs can be taken."""
@@ -40,10 +42,10 @@ class SizeFamily:
 
 
 FAMILIES = {
-    "block": SizeFamily((0.022, 0.029, 0.038, 0.050, 0.065)),
-    "cup": SizeFamily((0.031, 0.0395, 0.050, 0.063)),
-    "pepper": SizeFamily((0.030, 0.038, 0.048, 0.061)),
-    "button": SizeFamily((0.018, 0.025, 0.035, 0.049, 0.068)),
+    "block": SizeFamily("edge", (0.022, 0.029, 0.038, 0.050, 0.065)),
+    "cup": SizeFamily("outer diameter", (0.031, 0.0395, 0.050, 0.063)),
+    "pepper": SizeFamily("width", (0.030, 0.038, 0.048, 0.061)),
+    "button": SizeFamily("cap diameter", (0.018, 0.025, 0.035, 0.049, 0.068)),
 }
 """Adjacent ratios 1.31, 1.265, 1.265 and 1.40; what is to be grasped fits the open gripper."""
 

@@ -27,6 +27,7 @@ from sacil_tasks.instructions import Slots
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.poses import BASE_IN_WORLD_M, upright
+from sacil_tasks.robot_looks import lighten
 from sacil_tasks.sensing import CandidateSensor
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.variant import AWAY_M, Variant
@@ -46,6 +47,7 @@ class SizedTableEnv(BaseEnv):
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda"]
     SUPPORTED_REWARD_MODES: ClassVar[tuple[str, ...]] = ("sparse", "none")
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = wording.RESET_OPTIONS
     agent: Panda
 
     task: ClassVar[TaskSpec]
@@ -59,6 +61,7 @@ class SizedTableEnv(BaseEnv):
         *args: Any,
         robot_uids: str = "panda",
         num_envs: int = 1,
+        reward_mode: str | None = None,
         camera_rig: str = "aimed",
         reconfiguration_freq: int | None = None,
         enhanced_determinism: bool = True,
@@ -67,8 +70,11 @@ class SizedTableEnv(BaseEnv):
         """Build the first scene; what is not named here goes to ManiSkill.
 
         Raises:
-            UsageError: the camera rig is unknown.
+            UsageError: the camera rig or reward mode is unknown, or this machine cannot simulate
+                several environments at once.
         """
+        simulation.check_parallel(num_envs, kwargs.get("sim_backend", "auto"))
+        find_name(reward_mode or "none", self.SUPPORTED_REWARD_MODES, "reward mode")
         self._rig = cameras.RIGS[find_name(camera_rig, cameras.RIGS, "camera rig")]
         self._split = "canon"
         if reconfiguration_freq is None:
@@ -78,6 +84,7 @@ class SizedTableEnv(BaseEnv):
             *args,
             robot_uids=robot_uids,
             num_envs=num_envs,
+            reward_mode=reward_mode,
             reconfiguration_freq=reconfiguration_freq,
             enhanced_determinism=enhanced_determinism,
             **kwargs,
@@ -242,15 +249,16 @@ class SizedTableEnv(BaseEnv):
         Raises:
             UsageError: a seed or option does not belong to this task.
         """
-        seeds = [] if seed is None else np.atleast_1d(np.asarray(seed)).tolist()
-        for one in seeds:
-            scenes.partition_of(one)
+        seeds = [] if seed is None else np.atleast_1d(seed).tolist()
+        scenes.check_seeds(seeds, self.num_envs)
         self._check_options(options or {})
         gym.Env.reset(self, seed=seeds[0] if seeds else None)  # sets np_random
         return super().reset(seed, options)
 
     def _check_options(self, options: dict[str, Any]) -> None:
-        rebuild = self._will_rebuild(options)
+        wording.check_names(options, self.RESET_OPTIONS)
+        due = self.reconfiguration_freq != 0 and self._reconfig_counter == 0
+        rebuild = due or options.get("reconfigure", False)
         split = options.get("split", "canon" if rebuild else self._split)
         wording.check_options(self.task, split, options)
         if split != self._split and not rebuild:
@@ -259,11 +267,10 @@ class SizedTableEnv(BaseEnv):
                 'add "reconfigure": True to the options.'
             )
 
-    def _will_rebuild(self, options: dict[str, Any]) -> bool:
-        return self.reconfiguration_freq == 1 or options.get("reconfigure", False)
-
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE_IN_WORLD_M))
+        if self.scene.can_render():
+            lighten(self.agent.robot)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self._split = options.get("split", "canon")
@@ -307,6 +314,7 @@ class SizedTableEnv(BaseEnv):
         simulation.add_light(self.scene)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
+        env_idx = torch.as_tensor(env_idx, device=self.device)
         self.agent.reset(np.tile(HOME_QPOS, (len(env_idx), 1)))
         self.agent.robot.set_pose(sapien.Pose(BASE_IN_WORLD_M))
         seeds = [int(self._episode_seed[i]) for i in env_idx.tolist()]
@@ -341,6 +349,8 @@ class SizedTableEnv(BaseEnv):
         self._find_targets()
 
     def _after_control_step(self) -> None:
+        if self.scene.gpu_sim_enabled:
+            self.scene._gpu_fetch_all()  # noqa: SLF001 -- ManiSkill would, but after this
         self._update_events()
 
     def _after_simulation_step(self) -> None:
@@ -378,9 +388,15 @@ class SizedTableEnv(BaseEnv):
             extra["candidate_pose"] = torch.cat(
                 [candidate.pose.raw_pose for candidate in self.candidates], dim=-1
             )
-            extra["candidate_size"] = self._sizes_m
-            extra["asked"] = self._asked
+            extra["candidate_size"] = self._sizes_m.clone()
+            extra["asked"] = self._asked.clone()
+            extra["handle_order"] = self.events.handle_order.clone()
         return extra
+
+    def get_sensor_params(self) -> dict[str, dict[str, Tensor]]:
+        """ManiSkill's, as copies: it hands out the same objects at every step."""
+        shared = super().get_sensor_params()
+        return {name: {k: v.clone() for k, v in it.items()} for name, it in shared.items()}
 
     def get_state_dict(self) -> dict[str, Any]:
         """Physics, plus the task's own state as ints and floats, each "b n"."""

@@ -7,6 +7,7 @@ or say what is not meant.
 from collections.abc import Mapping
 from typing import Any
 
+from sacil_tasks.errors import UsageError, find_name
 from sacil_tasks.instructions import (
     Slots,
     check_slots,
@@ -19,6 +20,19 @@ from sacil_tasks.scenes import stream
 from sacil_tasks.spec import TaskSpec
 from sacil_tasks.splits import SPLITS, check_split
 
+RESET_OPTIONS = ("slots", "template", "split", "reconfigure", "env_idx", "reset_to_env_states")
+"""What `reset` may be told; the last three are ManiSkill's own."""
+
+
+def check_names(options: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    """Check that all options of a reset are known.
+
+    Raises:
+        UsageError: one is not.
+    """
+    for name in options:
+        find_name(name, known, "reset option")
+
 
 def check_options(task: TaskSpec, split: str, options: Mapping[str, Any]) -> None:
     """Accept a split, and the slots and template among the options of a reset.
@@ -28,7 +42,11 @@ def check_options(task: TaskSpec, split: str, options: Mapping[str, Any]) -> Non
     """
     check_split(task, split)
     if "slots" in options:
-        check_slots(task, options["slots"], split)
+        slots = options["slots"]
+        if not isinstance(slots, dict):
+            example = variations(task, split)[0]
+            raise UsageError(f"slots are words by name, such as {example}, but {slots!r} came.")
+        check_slots(task, slots, split)
     if "template" in options:
         check_template(task, options["template"])
 

@@ -72,6 +72,12 @@ class PickAndLiftEnv(SizedTableEnv):
         goals_m = self._to_tensor([layout.goal_m for layout in layouts])
         self.goal.set_pose(Pose.create_from_pq(goals_m))
 
+    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
+        extra = super()._get_obs_extra(info)
+        if self.obs_mode_struct.use_state:
+            extra["goal_position"] = self.goal.pose.p
+        return extra
+
     def _lenient_success(self, targets: Int[Tensor, "b n"]) -> Bool[Tensor, "b"]:
         gaps_m = (self._sensor.positions() - self.goal.pose.p[:, None]).norm(dim=-1)
         return self._pick((gaps_m <= GOAL_TOLERANCE_M) & self.events.grasped, targets)

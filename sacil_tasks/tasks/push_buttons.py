@@ -102,7 +102,8 @@ class PushButtonsEnv(SizedTableEnv):
         """Restore presses too: drive targets are not part of ManiSkill's state."""
         super().set_state_dict(state, env_idx)
         with writing_state(self.scene):
-            self._show_pressed(torch.arange(self.num_envs, device=self.device))
+            # During a reset ManiSkill writes to the environments being reset only.
+            self._show_pressed(self.scene._reset_mask.nonzero()[:, 0])  # noqa: SLF001
 
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         keyframes = []

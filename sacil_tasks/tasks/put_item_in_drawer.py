@@ -58,6 +58,9 @@ DROP_M = 0.062
 """Items are let go this far behind the outer face of the drawer's front: nearer to the cabinet
 the palm would meet the handle of the drawer above."""
 
+PALM_CLEAR_M = 0.025
+"""How far below the top of a neighbour the tool centre may go: the palm is 37 mm above it."""
+
 CARRY_M = 0.48
 """Height of the gripper while it carries an item over the cabinet."""
 
@@ -85,6 +88,7 @@ class PutItemInDrawerEnv(PlacingEnv):
     - strictly: no other cube was acquired or displaced
     """
 
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = (*PlacingEnv.RESET_OPTIONS, "drawer_open")
     task: ClassVar[TaskSpec] = SPEC
     fixture: Articulation
 
@@ -164,8 +168,10 @@ class PutItemInDrawerEnv(PlacingEnv):
     def _expert_keyframes(self, choice: tuple[int, ...]) -> list[Keyframe]:
         keyframes = self._open_drawer()
         beside_m = (0.0,) if len(choice) == 1 else (-0.055, 0.055)
+        inside_m = 0.0
         for k, place_m in zip(choice, beside_m, strict=True):
-            keyframes += self._put_in(k, place_m)
+            keyframes += self._put_in(k, place_m, inside_m)
+            inside_m = float(self.sizes_m[k])
         return keyframes
 
     def _open_drawer(self) -> list[Keyframe]:
@@ -189,8 +195,12 @@ class PutItemInDrawerEnv(PlacingEnv):
         """Gripper yaw that closes along the front: of the two, the one in (-90, 90] degrees."""
         return np.pi / 2 - (np.pi / 2 - self._fixture_yaw()) % np.pi
 
-    def _put_in(self, k: int, beside_m: float) -> list[Keyframe]:
-        """Take item `k` off the cabinet and let it down, `beside_m` off the drawer's middle."""
+    def _put_in(self, k: int, beside_m: float, inside_m: float) -> list[Keyframe]:
+        """Take item `k` off the cabinet and let it down, `beside_m` off the drawer's middle.
+
+        A small item falls the last bit where the palm would meet one of height `inside_m` that
+        is in the drawer already.
+        """
         (x, y, _), edge_m = self._start_pose(k)[0], float(self.sizes_m[k])
         grasp_m = grasp_height_m(edge_m)
         yaw, row_yaw = self._roomy_yaw(k), self._row_yaw()
@@ -198,7 +208,7 @@ class PutItemInDrawerEnv(PlacingEnv):
         over = self._on_fixture(np.array([OPENING_M - DROP_M, beside_m, CARRY_M]))
         floor_m = list(fixtures.HANDLE_HEIGHTS_M.values())[int(self._drawer[0])]
         floor_m += fixtures.DRAWER_FLOOR_M
-        down = np.array([*over[:2], floor_m + grasp_m + 0.007])
+        down = np.array([*over[:2], floor_m + max(grasp_m + 0.007, inside_m - PALM_CLEAR_M)])
         return [
             downwards(high, yaw, gripper_open=True, ignore_collisions=False),
             downwards(low, yaw, gripper_open=False, ignore_collisions=True),

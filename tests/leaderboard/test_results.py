@@ -1,7 +1,9 @@
 """The committed results belong to this code, and README says what they say."""
 
 import csv
-from collections.abc import Iterator
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from baselines.checkpoint import released_folder, sha256
 from leaderboard.protocol import protocol_of
 from leaderboard.records import EPISODES_FILE, EpisodeRecord, read_records
 from leaderboard.summary import write_summary
+from sacil_tasks.sizes import LABELS
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -65,15 +68,44 @@ def test_readme_has_the_table():
 
 
 def table() -> Iterator[str]:
-    """Rows of README's table: strict success, interval and count of each agent."""
+    """Rows of README's table: strict success, interval and count of each agent that played."""
     cells = {}
     for agent in AGENTS:
         with (RESULTS / "test" / agent / "summary.csv").open() as file:
             for row in csv.DictReader(file):
                 cells[row["task"], row["split"], agent] = cell(row)
     for task, split in dict.fromkeys(key[:2] for key in cells):
-        shown = " | ".join(cells[task, split, agent] for agent in AGENTS)
+        shown = " | ".join(cells.get((task, split, agent), "") for agent in AGENTS)
         yield f"| {task} | {split} | {shown} |"
+
+
+def test_readme_has_the_experts_table():
+    readme = (ROOT / "README.md").read_text()
+    for line in expert_table():
+        assert line in readme, "paste:\n" + "\n".join(expert_table())
+
+
+def expert_table() -> Iterator[str]:
+    """Rows of README's table: the expert's clean episodes by split, and by the size named first."""
+    played: dict[tuple[str, str], list[dict]] = {}
+    rejected: Counter[str] = Counter()
+    for line in (RESULTS / "audit" / "expert.jsonl").read_text().splitlines():
+        trial = json.loads(line)
+        _, task, split, *_ = trial["trial"]
+        for row in trial["rows"]:
+            played.setdefault((task, split), []).extend(row["episodes"])
+            rejected[task] += row["rejected"]
+    for task in sorted(task for task, split in played if split == "canon"):
+        canon = played[task, "canon"]
+        sizes = [[it for it in canon if it["asked"][0] == label] for label in LABELS]
+        shifts = [played.get((task, split), []) for split in ("shift_down", "shift_up")]
+        cells = " | ".join(clean(it) for it in (canon, *sizes, *shifts))
+        yield f"| {task} | {cells} | {rejected[task]} |"
+
+
+def clean(episodes: Sequence[dict]) -> str:
+    won = sum(it["clean"] for it in episodes)
+    return f"{won}/{len(episodes)}" if episodes else "n/a"
 
 
 def cell(row: dict[str, str]) -> str:

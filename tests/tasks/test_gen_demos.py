@@ -150,7 +150,7 @@ def test_a_demo_that_never_succeeds_fails_the_run_but_keeps_the_others(tmp_path)
     [
         ({"tasks": ("pick_up_cups",)}, "Did you mean pick_up_cup"),
         ({"tasks": (), "suite": "duals"}, "no suite called 'duals'"),
-        ({"split": "shift_up"}, "no split of pick_up_cup called 'shift_up'"),
+        ({"split": "shift_up"}, "pick_up_cup has no split shift_up"),
         ({"demos": 0}, "at least 1"),
     ],
 )
