@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.layers import LEAK, init_leaky, init_plain
-from baselines.views import CHANNELS, VIEWS
+from baselines.views import CHANNELS
 
 IMAGE_CHANNELS = len(CHANNELS) + 3
 """What is rendered, and three constant channels that say where a pixel lies."""
@@ -30,7 +30,7 @@ def with_locations(views: Float[Tensor, "b v 7 h w"]) -> Float[Tensor, "b v 10 h
     """Append view, row and column of each pixel, each from -1 to 1: RVT's constant channels
     (D-channels)."""
     b, v, _, h, w = views.shape
-    axes = [torch.linspace(-1, 1, steps, device=views.device) for steps in (len(VIEWS), h, w)]
+    axes = [torch.linspace(-1, 1, steps, device=views.device) for steps in (v, h, w)]
     places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=1).to(views.dtype)
     return torch.cat([views, places.expand(b, v, 3, h, w)], dim=2)
 
@@ -131,19 +131,19 @@ class PyramidStem(nn.Module):
 class PyramidDecoder(nn.Module):
     """The way back up the pyramid: at each level coarse map and skip are added (D-stem)."""
 
-    def __init__(self, token_channels: int, pyramid: tuple[int, ...]) -> None:
-        """`pyramid` lists the channels of the skips."""
+    def __init__(self, token_channels: int, pyramid: tuple[int, ...], out: int = 1) -> None:
+        """`pyramid` lists the channels of the skips, `out` are those at full resolution."""
         super().__init__()
         self.map_channels = (*pyramid, token_channels)
         steps = zip(pyramid, (*pyramid[1:], token_channels), strict=True)
         self.risers = nn.ModuleList(convolution(b, a, 1) for a, b in steps)
         self.laterals = nn.ModuleList(convolution(a, a, 1) for a in pyramid)
         self.mixers = nn.ModuleList(separable(a, a) for a in pyramid[1:])
-        self.heat = separable(pyramid[0], 4)
+        self.heat = separable(pyramid[0], 4 * out)
 
     def forward(
         self, tokens: Float[Tensor, "n c g g"], skips: Maps
-    ) -> tuple[Float[Tensor, "n 1 h w"], Maps]:
+    ) -> tuple[Float[Tensor, "n out h w"], Maps]:
         """Heatmap logits, four to a cell of the finest level, and the map of each level."""
         maps = [tokens]
         for level in reversed(range(len(skips))):
