@@ -131,19 +131,19 @@ class PyramidStem(nn.Module):
 class PyramidDecoder(nn.Module):
     """The way back up the pyramid: at each level coarse map and skip are added (D-stem)."""
 
-    def __init__(self, token_channels: int, pyramid: tuple[int, ...], out: int = 1) -> None:
-        """`pyramid` lists the channels of the skips, `out` are those at full resolution."""
+    def __init__(self, token_channels: int, pyramid: tuple[int, ...]) -> None:
+        """`pyramid` lists the channels of the skips."""
         super().__init__()
         self.map_channels = (*pyramid, token_channels)
         steps = zip(pyramid, (*pyramid[1:], token_channels), strict=True)
         self.risers = nn.ModuleList(convolution(b, a, 1) for a, b in steps)
         self.laterals = nn.ModuleList(convolution(a, a, 1) for a in pyramid)
         self.mixers = nn.ModuleList(separable(a, a) for a in pyramid[1:])
-        self.heat = separable(pyramid[0], 4 * out)
+        self.heat = separable(pyramid[0], 4)
 
     def forward(
         self, tokens: Float[Tensor, "n c g g"], skips: Maps
-    ) -> tuple[Float[Tensor, "n out h w"], Maps]:
+    ) -> tuple[Float[Tensor, "n 1 h w"], Maps]:
         """Heatmap logits, four to a cell of the finest level, and the map of each level."""
         maps = [tokens]
         for level in reversed(range(len(skips))):

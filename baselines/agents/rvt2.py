@@ -12,9 +12,9 @@ The preset `paper` is the published network (section 4 of that paper; 72,288,678
 512-wide text and four proprioceptive numbers); `cpu` keeps its steps at a size one core can train.
 """
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -34,7 +34,7 @@ from baselines.multiview import roughened
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.rotation import BINS
 from baselines.sight import Views, ZoomScene, ZoomSight
-from baselines.stems import IMAGE_CHANNELS, Maps, PyramidDecoder, PyramidStem, leaky
+from baselines.stems import IMAGE_CHANNELS, Maps, PyramidStem, leaky
 from baselines.text import TextSpec
 from baselines.views import THREE_VIEWS, View, project
 
@@ -67,13 +67,11 @@ class Rvt2Config(RvtConfig):
     upsample_kernel: int = 3
     """Kernel of the decoder's convolutions over tokens."""
 
-    convex_channels: int = 64
-    """Channels of those convolutions."""
+    convex_channels: int = 32
+    """Channels of the decoder's convolutions."""
 
     head_norm: Literal["layer", "batch"] = "layer"
     """Normalises what the angles are read from; RVT-2: `batch` (D-rvt2-norm)."""
-
-    head_hidden: tuple[int, int] = (128, 64)
 
     view_layers: int = 1
     joint_layers: int = 2
@@ -83,12 +81,6 @@ class Rvt2Config(RvtConfig):
         if self.stem == "patch":
             return BareStem(self.stem_channels, self.patch)
         return PyramidStem(self.pyramid, self.stem_channels)
-
-    def decoder_module(self) -> "ConvexDecoder | GuidedDecoder":
-        """A fresh decoder: token map and skips to heatmaps and the maps to read features from."""
-        if self.stem == "patch":
-            return ConvexDecoder(self)
-        return GuidedDecoder(self)
 
 
 CPU = Rvt2Config()
@@ -129,78 +121,43 @@ class BareStem(nn.Module):
 
 
 def convex_mix(
-    cells: Float[Tensor, "n 1 g g"], shares: Float[Tensor, "n 9 h w"]
+    cells: Float[Tensor, "n 1 g g"], shares: Float[Tensor, "n s g g"]
 ) -> Float[Tensor, "n 1 h w"]:
     """Each pixel's mix of the 3 x 3 cells about its own; beyond the edge they are 0.
 
-    `shares` are logits: a softmax makes them convex.
+    `shares` are logits, for each of the nine those of all pixels of a cell, row by row; a softmax
+    over the nine makes them convex.
     """
     n, _, g, _ = cells.shape
-    around = functional.unfold(cells, 3, padding=1).view(n, NEIGHBOURS, g, 1, g, 1)
-    parts = rearrange(shares.softmax(1), "n k (y i) (x j) -> n k y i x j", y=g, x=g)
-    return rearrange((parts * around).sum(1, keepdim=True), "n k y i x j -> n k (y i) (x j)")
-
-
-def convolutions(fan_in: int, fan_out: int, config: Rvt2Config, *, layers: int) -> nn.Sequential:
-    """So many convolutions over tokens, each followed by a ReLU."""
-    sizes = [fan_in, *[fan_out] * layers]
-    kernel = config.upsample_kernel
-    parts: list[nn.Module] = []
-    for a, b in pairwise(sizes):
-        parts += [nn.Conv2d(a, b, kernel, padding=kernel // 2), nn.ReLU()]
-    return nn.Sequential(*parts)
-
-
-class TokenLogits(nn.Sequential):
-    """One heatmap logit per token."""
-
-    def __init__(self, config: Rvt2Config) -> None:
-        """Sizes as in `config`."""
-        channels, kernel = config.convex_channels, config.upsample_kernel
-        super().__init__(
-            *convolutions(config.lowered_channels, channels, config, layers=2),
-            nn.Conv2d(channels, 1, kernel, padding=kernel // 2),
-        )
+    around = rearrange(functional.unfold(cells, 3, padding=1), "n k c -> (n c) 1 k")
+    weights = rearrange(shares, "n (k p) y x -> (n y x) k p", k=NEIGHBOURS).softmax(1)
+    mixed = around.to(weights.dtype) @ weights
+    side = math.isqrt(mixed.shape[-1])
+    return rearrange(mixed, "(n y x) 1 (i j) -> n 1 (y i) (x j)", n=n, y=g, i=side)
 
 
 class ConvexDecoder(nn.Module):
-    """RVT-2's: both the logits and the shares of their mix come from the tokens."""
+    """Token maps to heatmaps: a logit per token, up-sampled by shares that each token gives out.
+
+    No map of full resolution is ever convolved, which is half of what makes RVT-2 fast.
+    """
 
     def __init__(self, config: Rvt2Config) -> None:
         """Sizes as in `config`."""
         super().__init__()
-        self.patch = config.patch
-        self.map_channels = (config.lowered_channels,)
-        self.cells = TokenLogits(config)
+        fan_in, channels = config.lowered_channels, config.convex_channels
+        kernel = config.upsample_kernel
+        conv = partial(nn.Conv2d, kernel_size=kernel, padding=kernel // 2)
+        cells = (conv(fan_in, channels), nn.ReLU(), conv(channels, channels), nn.ReLU())
+        self.cells = nn.Sequential(*cells, conv(channels, 1))
+        pixels = NEIGHBOURS * config.patch**2
         self.shares = nn.Sequential(
-            *convolutions(config.lowered_channels, config.convex_channels, config, layers=1),
-            nn.Conv2d(config.convex_channels, NEIGHBOURS * config.patch**2, 1),
+            conv(fan_in, channels), nn.ReLU(), nn.Conv2d(channels, pixels, 1)
         )
 
-    def forward(
-        self, tokens: Float[Tensor, "n c g g"], skips: Maps
-    ) -> tuple[Float[Tensor, "n 1 h w"], Maps]:
-        """Heatmap logits, and the token map as the only one."""
-        shares = functional.pixel_shuffle(SHARE_SCALE * self.shares(tokens), self.patch)
-        return convex_mix(self.cells(tokens), shares), [tokens]
-
-
-class GuidedDecoder(nn.Module):
-    """The shares come from the pyramid, which has seen every pixel (D-rvt2-shares)."""
-
-    def __init__(self, config: Rvt2Config) -> None:
-        """Sizes as in `config`."""
-        super().__init__()
-        self.cells = TokenLogits(config)
-        self.shares = PyramidDecoder(config.lowered_channels, config.pyramid, out=NEIGHBOURS)
-        self.map_channels = self.shares.map_channels
-
-    def forward(
-        self, tokens: Float[Tensor, "n c g g"], skips: Maps
-    ) -> tuple[Float[Tensor, "n 1 h w"], Maps]:
-        """Heatmap logits, and the map of each level of the pyramid."""
-        shares, maps = self.shares(tokens, skips)
-        return convex_mix(self.cells(tokens), shares), maps
+    def forward(self, tokens: Float[Tensor, "n c g g"]) -> Float[Tensor, "n 1 h w"]:
+        """Heatmap logits."""
+        return convex_mix(self.cells(tokens), SHARE_SCALE * self.shares(tokens))
 
 
 @dataclass(frozen=True)
@@ -208,14 +165,15 @@ class Look:
     """What a stage makes of its views; `n` counts the views of all samples, sample by sample."""
 
     read: Read
+    """The transformer's tokens, for who wants to contrast them."""
+
     heatmaps: Float[Tensor, "b v h w"]
     tokens: Float[Tensor, "n c g g"]
-    maps: Maps
 
     def features_at(self, positions: Float[Tensor, "b 3"]) -> Float[Tensor, "b f"]:
-        """Strongest token features of each view, and what the maps hold where `positions` are."""
+        """Strongest token features of each view, and those where `positions` are."""
         places = project(positions, 2, THREE_VIEWS).flatten(0, 1) - 1
-        reads = [self.tokens.amax(dim=(-2, -1)), *(sample(m, places) for m in self.maps)]
+        reads = [self.tokens.amax(dim=(-2, -1)), sample(self.tokens, places)]
         views = self.heatmaps.shape[1]
         return torch.cat([rearrange(r, "(b v) c -> b (v c)", v=views) for r in reads], dim=-1)
 
@@ -238,25 +196,24 @@ class Stage(Transformer):
         super().__init__(config, text)
         self.grid = config.grid
         self.lower = linear(config.width, config.lowered_channels)
-        self.decoder = config.decoder_module()
+        self.decoder = ConvexDecoder(config)
 
     def forward(self, scene: Views, inputs: Inputs) -> Look:
         """Look at a scene with the words and the proprioception of `inputs`."""
         read = self.read(scene.views, inputs)
         shape = {"v": self.views, "y": self.grid, "x": self.grid}
         tokens = rearrange(self.lower(read.joined), "b (v y x) c -> (b v) c y x", **shape)
-        heat, maps = self.decoder(tokens, read.skips)
-        heatmaps = rearrange(heat, "(b v) 1 h w -> b v h w", v=self.views).float()
-        return Look(read=read, heatmaps=heatmaps, tokens=tokens, maps=maps)
+        heat = rearrange(self.decoder(tokens), "(b v) 1 h w -> b v h w", v=self.views)
+        return Look(read=read, heatmaps=heat.float(), tokens=tokens)
 
 
 class WaypointHead(nn.Module):
     """Gripper, collision, and the angles one after the other: each knows those before it."""
 
-    def __init__(self, config: Rvt2Config, map_channels: Sequence[int]) -> None:
-        """`map_channels` are those of the maps that features are read from."""
+    def __init__(self, config: Rvt2Config) -> None:
+        """Sizes as in `config`."""
         super().__init__()
-        width = len(config.views) * (config.lowered_channels + sum(map_channels))
+        width = len(config.views) * 2 * config.lowered_channels
         self.flags = mlp((width, *config.head_hidden, 4))
         self.norm = nn.BatchNorm1d(width) if config.head_norm == "batch" else nn.LayerNorm(width)
         self.angles = nn.ModuleList(mlp((width, *config.head_hidden, BINS)) for _ in range(3))
@@ -295,7 +252,7 @@ class Rvt2(Network):
         self.sight = ZoomSight(config.pixels, draws=DRAWS)
         self.coarse = Stage(config, text)
         self.fine = Stage(config, text)
-        self.head = WaypointHead(config, self.fine.decoder.map_channels)
+        self.head = WaypointHead(config)
 
     def loss(self, batch: Batch[ZoomScene]) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning only."""

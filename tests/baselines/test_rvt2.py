@@ -91,9 +91,9 @@ def test_the_answer_is_the_zoomed_one_about_the_coarse_one(network: Rvt2) -> Non
 
 
 def test_pixels_are_convex_mixes_of_the_cells_about_their_own() -> None:
-    cells, shares = torch.randn(2, 1, 4, 4), torch.randn(2, 9, 12, 12)
+    cells, shares = torch.randn(2, 1, 4, 4), torch.randn(2, 9 * 3 * 3, 4, 4)
     mixed, padded = convex_mix(cells, shares), torch.nn.functional.pad(cells, (1, 1, 1, 1))
-    weights = shares.softmax(1)
+    weights = torch.nn.functional.pixel_shuffle(shares, 3).softmax(1)
     for y, x in np.ndindex(12, 12):
         near = padded[:, 0, y // 3 : y // 3 + 3, x // 3 : x // 3 + 3].flatten(1)
         expected = (near * weights[:, :, y, x]).sum(1)
@@ -101,8 +101,9 @@ def test_pixels_are_convex_mixes_of_the_cells_about_their_own() -> None:
 
 
 def test_a_share_of_one_copies_its_cell() -> None:
-    cells, shares = torch.randn(1, 1, 4, 4), torch.zeros(1, 9, 8, 8)
+    cells, shares = torch.randn(1, 1, 4, 4), torch.zeros(1, 9, 2 * 2, 4, 4)
     shares[:, 4] = 100.0
+    shares = shares.flatten(1, 2)
     expected = cells.repeat_interleave(2, -1).repeat_interleave(2, -2)
     torch.testing.assert_close(convex_mix(cells, shares), expected)
 
@@ -115,20 +116,20 @@ def test_features_are_read_at_cell_centres_and_between_them() -> None:
 
 
 def test_features_come_from_where_the_point_projects(network: Rvt2) -> None:
-    """A map that holds its own cell coordinates gives back the point, view by view."""
+    """Tokens that hold their own place give back the point, view by view."""
     inputs = make_inputs(SIGHT, size=1)
     with torch.no_grad():
         look = network.coarse(inputs.scene, inputs)
     line = (torch.arange(8) + 0.5) / 4 - 1
     u, v = line.expand(8, 8), line[:, None].expand(8, 8)
-    look = replace(look, maps=[torch.stack([u, v]).expand(3, 2, 8, 8)])
+    look = replace(look, tokens=torch.stack([u, v]).expand(3, 2, 8, 8))
     x, y, z = 0.3, -0.2, 0.5
     found = look.features_at(torch.tensor([[x, y, z]]))[0, -6:]
     torch.testing.assert_close(found, torch.tensor([x, -y, y, -z, -x, -z]))
 
 
 def test_later_angles_hear_of_earlier_ones_and_not_the_reverse() -> None:
-    head = WaypointHead(CONFIG, (4,)).eval()
+    head = WaypointHead(CONFIG).eval()
     features = torch.randn(2, head.flags[0].in_features)
     rotation, flags = head(features, torch.tensor([[3, 5], [3, 5]]))
     other_y, same_flags = head(features, torch.tensor([[3, 6], [3, 6]]))
@@ -141,7 +142,7 @@ def test_later_angles_hear_of_earlier_ones_and_not_the_reverse() -> None:
 
 
 def test_acting_goes_by_the_likeliest_angles() -> None:
-    head = WaypointHead(CONFIG, (4,)).eval()
+    head = WaypointHead(CONFIG).eval()
     features = torch.randn(2, head.flags[0].in_features)
     rotation, _ = head(features, None)
     again, _ = head(features, rotation[:, :2].argmax(-1))
