@@ -71,7 +71,7 @@ class Rvt2Config(RvtConfig):
     """Channels of the decoder's convolutions."""
 
     head_norm: Literal["layer", "batch"] = "layer"
-    """Normalises what the angles are read from; RVT-2: `batch` (D-rvt2-norm)."""
+    """Normalises what the angles are read from; RVT-2: `batch` (D-zoom-norm)."""
 
     view_layers: int = 1
     joint_layers: int = 2
@@ -85,6 +85,7 @@ class Rvt2Config(RvtConfig):
 
 CPU = Rvt2Config()
 
+# D-zoom-recipe: the iterations and the batch of SACIL's paper.
 PAPER = Rvt2Config(
     pixels=224,
     patch=14,
@@ -182,7 +183,7 @@ def sample(
     features: Float[Tensor, "n c g g"], places: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n c"]:
     """A map's features at (u, v), each from -1 to 1 edge to edge: bilinear, constant beyond the
-    centres of the outermost cells (D-rvt2-sample)."""
+    centres of the outermost cells (D-zoom-sample)."""
     grid = places[:, None, None].to(features.dtype)
     read = functional.grid_sample(features, grid, padding_mode="border", align_corners=False)
     return read[..., 0, 0]

@@ -78,7 +78,7 @@ class SacilRvt2(Rvt2):
         config, same = self.config, same_meaning(batch)
         look = self.coarse_look(batch)
         total, terms = self.cloning_loss(look, batch)
-        # D-rvt2-proprio: RVT-2 has let proprioception in before the first layer.
+        # D-zoom-proprio: RVT-2 has let proprioception in before the first layer.
         image, sentence = look.read.alone.mean(dim=1), self.sentence(last_token(batch.inputs))
         loss, cosines = self.image_text(image, sentence, same)
         total = total + config.image_text_weight * loss
