@@ -19,7 +19,6 @@ from baselines.views import (
     CHANNELS,
     THREE_VIEWS,
     VIEWS,
-    View,
     apply_affine,
     cube_from_base,
     render_views,
@@ -105,7 +104,7 @@ class CubeCloud:
 
 @dataclass(frozen=True)
 class ZoomScene(Views):
-    """Virtual views, and the clouds they show, so that a part of the scene can be drawn larger."""
+    """RVT-2's views, and the clouds they show, so that a part of the scene can be drawn larger."""
 
     clouds: tuple[CubeCloud, ...]
     """One a sample."""
@@ -113,9 +112,7 @@ class ZoomScene(Views):
     draws: Float[Tensor, "b r"]
     """Uniform in [0, 1): the random choices of training, so that a loss needs no generator."""
 
-    def closer(
-        self, centers: Float[Tensor, "b 3"], zoom: float, chosen: tuple[View, ...] = THREE_VIEWS
-    ) -> Views:
+    def closer(self, centers: Float[Tensor, "b 3"], zoom: float) -> Views:
         """The views of a cube of side 2 / `zoom` about each centre, as large as those of the whole.
 
         A point p of the cube is drawn at `zoom * (p - center)`; what leaves [-1, 1]^3 is dropped
@@ -124,20 +121,19 @@ class ZoomScene(Views):
         turn = zoom * torch.eye(3).expand(len(centers), 3, 3)
         shift = -zoom * centers.detach().float().cpu()
         transforms = torch.cat([turn, shift[..., None]], dim=-1).numpy()
-        views = _draw(self.clouds, transforms, self.views.shape[-1], chosen)
+        views = _three_views(self.clouds, transforms, self.views.shape[-1])
         return Views(views.to(self.views.device))
 
 
 class ZoomSight:
-    """Draws some virtual views and keeps the clouds."""
+    """Draws RVT-2's three views and keeps the clouds."""
 
     remembers = False
 
-    def __init__(self, pixels: int, *, draws: int, views: tuple[View, ...] = THREE_VIEWS) -> None:
+    def __init__(self, pixels: int, *, draws: int) -> None:
         """Views of `pixels` a side, and so many random numbers a sample."""
         self.pixels = pixels
         self.draws = draws
-        self.views = views
 
     def look(self, moments: Sequence[Moment]) -> ZoomScene:
         """Unproject, move, crop and draw each scene."""
@@ -148,7 +144,7 @@ class ZoomSight:
         whole = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (len(clouds), 3, 4))
         draws = [np.random.default_rng(moment.seed).random(self.draws) for moment in moments]
         return ZoomScene(
-            views=_draw(clouds, whole, self.pixels, self.views),
+            views=_three_views(clouds, whole, self.pixels),
             clouds=clouds,
             draws=torch.tensor(np.stack(draws), dtype=torch.float32),
         )
@@ -158,16 +154,13 @@ def _cloud(seen: Observation) -> Cloud:
     return unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
 
 
-def _draw(
-    clouds: Sequence[CubeCloud],
-    transforms: Float32[np.ndarray, "b 3 4"],
-    pixels: int,
-    chosen: tuple[View, ...],
-) -> Float[Tensor, "b v 7 h w"]:
+def _three_views(
+    clouds: Sequence[CubeCloud], transforms: Float32[np.ndarray, "b 3 4"], pixels: int
+) -> Float[Tensor, "b 3 7 h w"]:
     """Each cloud's views after its transform."""
-    views = np.empty((len(clouds), len(chosen), len(CHANNELS), pixels, pixels), np.float32)
+    views = np.empty((len(clouds), len(THREE_VIEWS), len(CHANNELS), pixels, pixels), np.float32)
     for cloud, transform, out in zip(clouds, transforms, views, strict=True):
-        render_views(cloud.xyz_in_cube, cloud.rgb, transform, pixels, out, chosen)
+        render_views(cloud.xyz_in_cube, cloud.rgb, transform, pixels, out, THREE_VIEWS)
     return torch.from_numpy(views)
 
 

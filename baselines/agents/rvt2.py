@@ -42,7 +42,7 @@ NEIGHBOURS = 9
 """Token logits that a pixel's logit is mixed from: its own cell's and those around it."""
 
 SHARE_SCALE = 0.1
-"""Keeps the mixing shares nearly equal at first (as in RAFT, where convex upsampling is from)."""
+"""Keeps the mixing shares nearly equal at first, as published."""
 
 JITTER = (-2, 2)
 """Range of the bins by which the angles shown to the next ones are off in training; the upper end
@@ -140,7 +140,7 @@ def convex_mix(
 class ConvexDecoder(nn.Module):
     """Token maps to heatmaps: a logit per token, up-sampled by shares that each token gives out.
 
-    No map of full resolution is ever convolved, which is half of what makes RVT-2 fast.
+    No map of full resolution is ever convolved.
     """
 
     def __init__(self, config: Rvt2Config) -> None:
@@ -184,8 +184,9 @@ def sample(
 ) -> Float[Tensor, "n c"]:
     """A map's features at (u, v), each from -1 to 1 edge to edge: bilinear, constant beyond the
     centres of the outermost cells (D-zoom-sample)."""
-    grid = places[:, None, None].to(features.dtype)
-    read = functional.grid_sample(features, grid, padding_mode="border", align_corners=False)
+    read = functional.grid_sample(
+        features.float(), places[:, None, None].float(), padding_mode="border", align_corners=False
+    )
     return read[..., 0, 0]
 
 
@@ -210,6 +211,8 @@ class Stage(Transformer):
 
 class WaypointHead(nn.Module):
     """Gripper, collision, and the angles one after the other: each knows those before it."""
+
+    codes: Tensor
 
     def __init__(self, config: Rvt2Config) -> None:
         """Sizes as in `config`."""
