@@ -8,7 +8,7 @@ A stage is RVT's transformer with its own weights; its heatmaps are convex mixes
 token. In training the fine stage looks at a point near the label, so it needs no good coarse
 stage to learn, and nothing it learns reaches the coarse one.
 
-The preset `paper` is the published network (section 4 of that paper; 72,288,678 parameters with
+The preset `paper` is the published network (section III of that paper; 72,288,678 parameters with
 512-wide text and four proprioceptive numbers); `cpu` keeps its steps at a size one core can train.
 """
 
