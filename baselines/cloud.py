@@ -45,6 +45,18 @@ def unproject(
     return Cloud(xyz_in_base=xyz_in_base[:count], rgb=colours[:count])
 
 
+def crop_to_cube(
+    cloud: Cloud, cube_from_base: Float32[np.ndarray, "3 4"]
+) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Cube coordinates and colours of the points that lie in [-1, 1]^3.
+
+    `cube_from_base` includes the augmentation.
+    """
+    xyz_in_cube, colours = np.empty_like(cloud.xyz_in_base), np.empty_like(cloud.rgb)
+    count = _crop(cloud.xyz_in_base, cloud.rgb, cube_from_base, xyz_in_cube, colours)
+    return xyz_in_cube[:count].copy(), colours[:count].copy()
+
+
 def point_maps(
     depth_mm: UInt16[np.ndarray, "k h w"],
     intrinsics: Float32[np.ndarray, "k 3 3"],
@@ -106,6 +118,30 @@ def _lift(
                 colours[count, 1] = rgb[k, i, j, 1]
                 colours[count, 2] = rgb[k, i, j, 2]
                 count += 1
+    return count
+
+
+@compiled
+def _crop(
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    transform: np.ndarray,
+    xyz_in_cube: np.ndarray,
+    colours: np.ndarray,
+) -> int:
+    """Write the points inside the cube into the last two arrays and return how many there are."""
+    one = np.float32(1)
+    count = 0
+    for i in range(len(xyz)):
+        px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        x = transform[0, 0] * px + transform[0, 1] * py + transform[0, 2] * pz + transform[0, 3]
+        y = transform[1, 0] * px + transform[1, 1] * py + transform[1, 2] * pz + transform[1, 3]
+        z = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2] * pz + transform[2, 3]
+        if abs(x) <= one and abs(y) <= one and abs(z) <= one:
+            xyz_in_cube[count, 0], xyz_in_cube[count, 1], xyz_in_cube[count, 2] = x, y, z
+            colours[count, 0], colours[count, 1] = rgb[i, 0], rgb[i, 1]
+            colours[count, 2] = rgb[i, 2]
+            count += 1
     return count
 
 

@@ -83,6 +83,13 @@ def action_loss(
     target = target_heatmaps(
         labels.position_in_cube, logits.heatmaps.shape[-1], recipe.heatmap_sigma_px
     )
+    return loss_of_maps(logits, target, labels, recipe)
+
+
+def loss_of_maps(
+    logits: ActionLogits, target: Float[Tensor, "b v h w"], labels: Labels, recipe: Recipe
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same where the network has views of its own: `target` is what its heatmaps should be."""
     terms = {
         "bc/position": _heatmap_loss(logits.heatmaps, target),
         "bc/rotation": _rotation_loss(logits.rotation, labels, recipe.rotation_sigma_bins),
@@ -111,8 +118,13 @@ def _rotation_loss(logits: Float[Tensor, "b 3 bins"], labels: Labels, sigma_bins
 
 def choose(logits: ActionLogits) -> Prediction:
     """The most likely keyframe."""
+    return choose_at(decode(logits.heatmaps), logits)
+
+
+def choose_at(position_in_cube: Float[Tensor, "b 3"], logits: ActionLogits) -> Prediction:
+    """The same where the network finds the position in a way of its own."""
     return Prediction(
-        position_in_cube=decode(logits.heatmaps),
+        position_in_cube=position_in_cube,
         quaternion_wxyz=bins_to_quaternion(logits.rotation.argmax(-1)),
         gripper_open=logits.gripper.argmax(-1) == 1,
         ignore_collisions=logits.collision.argmax(-1) == 1,

@@ -9,13 +9,15 @@ grid at the cost of three images.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from baselines.compiled import compiled
-from baselines.views import project
+from baselines.views import VIEWS, View, project
 
 SIGMA_PX = 1.5
 """Width of the target heatmap in pixels, as in RVT."""
@@ -28,14 +30,17 @@ REFINE_CELLS = 2
 
 
 def target_heatmaps(
-    points_in_cube: Float[torch.Tensor, "b 3"], pixels: int, sigma_px: float = SIGMA_PX
-) -> Float[torch.Tensor, "b 5 h w"]:
+    points_in_cube: Float[torch.Tensor, "b 3"],
+    pixels: int,
+    sigma_px: float = SIGMA_PX,
+    views: Sequence[View] = VIEWS,
+) -> Float[torch.Tensor, "b v h w"]:
     """Gaussians about the projections of the labels; each view sums to 1.
 
     Only the small window that is not zero is computed. Labels must lie in the cube.
     """
     reach = math.ceil(CUTOFF_SIGMAS * sigma_px)
-    uv = project(points_in_cube, pixels)[..., None]
+    uv = project(points_in_cube, pixels, views)[..., None]
     window = uv.floor() + torch.arange(-reach, reach + 1, device=uv.device)
     heights = torch.exp((window + 0.5 - uv).square() / (-2 * sigma_px**2))
     heights = heights * ((window >= 0) & (window < pixels))
@@ -51,28 +56,40 @@ def target_heatmaps(
 
 
 @torch.no_grad()
-def decode(logits: Float[torch.Tensor, "b 5 h w"]) -> Float[torch.Tensor, "b 3"]:
+def decode(
+    logits: Float[torch.Tensor, "b v h w"], views: Sequence[View] = VIEWS
+) -> Float[torch.Tensor, "b 3"]:
     """The cube point on which the views agree best.
 
     It is the softmax-weighted mean of the cells about the best cell of the whole grid (the first
     in the order x, y, z among equals). The mean spans the same number of cells to both sides, so
     a best cell on the border of the cube is not pulled inwards.
     """
-    planes = [plane.contiguous().cpu().numpy() for plane in score_planes(logits.float())]
+    planes = [plane.contiguous().cpu().numpy() for plane in score_planes(logits.float(), views)]
     points = np.empty((len(logits), 3), np.float32)
     _decode(*planes, points)
     return torch.from_numpy(points).to(logits.device)
 
 
 def score_planes(
-    logits: Float[torch.Tensor, "b 5 h w"],
+    logits: Float[torch.Tensor, "b v h w"], views: Sequence[View] = VIEWS
 ) -> tuple[
     Float[torch.Tensor, "b x y"], Float[torch.Tensor, "b x z"], Float[torch.Tensor, "b y z"]
 ]:
-    """Log-probabilities turned to cube axes and added: A(x, y), B(x, z), C(y, z)."""
+    """Log-probabilities turned to cube axes and added: A(x, y), B(x, z), C(y, z).
+
+    A plane that no view shows is 0.
+    """
     heights = logits.flatten(-2).log_softmax(dim=-1).view_as(logits)
-    top, front, back, left, right = heights.flip(-2).transpose(-1, -2).unbind(dim=1)
-    return top, front.flip(-2) + back, left + right.flip(-2)
+    along_axes = heights.flip(-2).transpose(-1, -2).unbind(dim=1)
+    planes: dict[tuple[int, int], Tensor] = {}
+    for view, plane in zip(views, along_axes, strict=True):
+        axes = view.u_axis, view.v_axis
+        turned = plane if view.u_sign > 0 else plane.flip(-2)
+        planes[axes] = planes[axes] + turned if axes in planes else turned
+    nothing = torch.zeros_like(along_axes[0])
+    xy, xz, yz = (planes.get(axes, nothing) for axes in ((0, 1), (0, 2), (1, 2)))
+    return xy, xz, yz
 
 
 @compiled

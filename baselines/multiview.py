@@ -4,7 +4,7 @@ views -> ViewEncoder -> tokens, skips -> (the agent's transformer) -> ActionDeco
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from einops import rearrange
@@ -24,13 +24,16 @@ from baselines.stems import (
     PyramidStem,
     with_locations,
 )
-from baselines.views import VIEWS
+from baselines.views import VIEWS, View
 from sacil_tasks.errors import UsageError
 
 
 @dataclass(frozen=True, kw_only=True)
 class MultiViewConfig:
     """Sizes of a view-based network; the defaults are the `cpu` preset (D-cpu)."""
+
+    views: ClassVar[tuple[View, ...]] = VIEWS
+    """Which views it looks at."""
 
     pixels: int = 96
     """Pixels per side of a virtual view."""
@@ -97,6 +100,12 @@ class MultiViewConfig:
         """Tokens per side of a view."""
         return self.pixels // self.patch
 
+    def stem_module(self) -> nn.Module:
+        """A fresh stem: images to token map and skips."""
+        if self.stem == "patch":
+            return PatchStem(self.stem_channels, self.patch)
+        return PyramidStem(self.pyramid, self.stem_channels)
+
     @property
     def block_sizes(self) -> BlockSizes:
         """Sizes of every transformer block."""
@@ -115,20 +124,16 @@ class ViewEncoder(nn.Module):
     def __init__(self, config: MultiViewConfig) -> None:
         """Sizes as in `config`."""
         super().__init__()
-        self.stem: PatchStem | PyramidStem
-        if config.stem == "patch":
-            self.stem = PatchStem(config.stem_channels, config.patch)
-        else:
-            self.stem = PyramidStem(config.pyramid, config.stem_channels)
+        self.stem = config.stem_module()
 
     def forward(self, views: Float[Tensor, "b v 7 h w"]) -> tuple[Float[Tensor, "b t c"], Maps]:
         """Tokens, view by view and row by row, and the skips for the decoder."""
         tokens, skips = self.stem(with_locations(views).flatten(0, 1))
-        return rearrange(tokens, "(b v) c y x -> b (v y x) c", v=len(VIEWS)), skips
+        return rearrange(tokens, "(b v) c y x -> b (v y x) c", v=views.shape[1]), skips
 
 
 class ActionDecoder(nn.Module):
-    """Tokens after the transformer, and the stem's skips, to the action's logits."""
+    """RVT's: tokens after the transformer, and the stem's skips, to the action's logits."""
 
     def __init__(self, config: MultiViewConfig) -> None:
         """Sizes as in `config`."""
@@ -160,7 +165,7 @@ def positions(config: MultiViewConfig, channels: int) -> nn.Parameter:
     would drown what the convolutions found (D-position).
     """
     spread = 1.0 if config.stem == "patch" else 0.02
-    return nn.Parameter(spread * torch.randn(1, len(VIEWS) * config.grid**2, channels))
+    return nn.Parameter(spread * torch.randn(1, len(config.views) * config.grid**2, channels))
 
 
 def blocks(count: int, config: MultiViewConfig) -> nn.ModuleList:
@@ -168,12 +173,14 @@ def blocks(count: int, config: MultiViewConfig) -> nn.ModuleList:
     return nn.ModuleList(SelfBlock(config.block_sizes) for _ in range(count))
 
 
-def within_views(layers: nn.ModuleList, tokens: Float[Tensor, "b t d"]) -> Float[Tensor, "b t d"]:
+def within_views(
+    layers: nn.ModuleList, tokens: Float[Tensor, "b t d"], views: int = len(VIEWS)
+) -> Float[Tensor, "b t d"]:
     """Apply blocks to each view's tokens alone."""
-    each = rearrange(tokens, "b (v p) d -> (b v) p d", v=len(VIEWS))
+    each = rearrange(tokens, "b (v p) d -> (b v) p d", v=views)
     for block in layers:
         each = block(each)
-    return rearrange(each, "(b v) p d -> b (v p) d", v=len(VIEWS))
+    return rearrange(each, "(b v) p d -> b (v p) d", v=views)
 
 
 def last_token(inputs: Inputs) -> Float[Tensor, "b e"]:

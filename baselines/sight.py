@@ -14,8 +14,15 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from baselines.augment import Augmentation
-from baselines.cloud import point_maps, unproject
-from baselines.views import CHANNELS, VIEWS, apply_affine, cube_from_base, render_views
+from baselines.cloud import Cloud, crop_to_cube, point_maps, unproject
+from baselines.views import (
+    CHANNELS,
+    THREE_VIEWS,
+    VIEWS,
+    apply_affine,
+    cube_from_base,
+    render_views,
+)
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, Observation
 
 STILL = Augmentation(0.0, np.zeros(3))
@@ -82,10 +89,79 @@ class ViewSight:
         shape = (len(VIEWS), len(CHANNELS), self.pixels, self.pixels)
         views = np.empty((len(moments), *shape), np.float32)
         for moment, out in zip(moments, views, strict=True):
-            seen = moment.seen
-            cloud = unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
+            cloud = _cloud(moment.seen)
             render_views(cloud.xyz_in_base, cloud.rgb, moment.move.to_cube(), self.pixels, out)
         return Views(torch.from_numpy(views))
+
+
+@dataclass(frozen=True)
+class CubeCloud:
+    """A coloured cloud, moved and cropped to the cube; host memory, for the renderer."""
+
+    xyz_in_cube: Float32[np.ndarray, "n 3"]
+    rgb: UInt8[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class ZoomScene(Views):
+    """RVT-2's views, and the clouds they show, so that a part of the scene can be drawn larger."""
+
+    clouds: tuple[CubeCloud, ...]
+    """One a sample."""
+
+    draws: Float[Tensor, "b r"]
+    """Uniform in [0, 1): the random choices of training, so that a loss needs no generator."""
+
+    def closer(self, centers: Float[Tensor, "b 3"], zoom: float) -> Views:
+        """The views of a cube of side 2 / `zoom` about each centre, as large as those of the whole.
+
+        A point p of the cube is drawn at `zoom * (p - center)`; what leaves [-1, 1]^3 is dropped
+        (D-zoom-crop).
+        """
+        turn = zoom * torch.eye(3).expand(len(centers), 3, 3)
+        shift = -zoom * centers.detach().float().cpu()
+        transforms = torch.cat([turn, shift[..., None]], dim=-1).numpy()
+        views = _three_views(self.clouds, transforms, self.views.shape[-1])
+        return Views(views.to(self.views.device))
+
+
+class ZoomSight:
+    """Draws RVT-2's three views and keeps the clouds."""
+
+    remembers = False
+
+    def __init__(self, pixels: int, *, draws: int) -> None:
+        """Views of `pixels` a side, and so many random numbers a sample."""
+        self.pixels = pixels
+        self.draws = draws
+
+    def look(self, moments: Sequence[Moment]) -> ZoomScene:
+        """Unproject, move, crop and draw each scene."""
+        clouds = tuple(
+            CubeCloud(*crop_to_cube(_cloud(moment.seen), moment.move.to_cube()))
+            for moment in moments
+        )
+        whole = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (len(clouds), 3, 4))
+        draws = [np.random.default_rng(moment.seed).random(self.draws) for moment in moments]
+        return ZoomScene(
+            views=_three_views(clouds, whole, self.pixels),
+            clouds=clouds,
+            draws=torch.tensor(np.stack(draws), dtype=torch.float32),
+        )
+
+
+def _cloud(seen: Observation) -> Cloud:
+    return unproject(seen.rgb, seen.depth_mm, seen.intrinsics, seen.camera_in_base)
+
+
+def _three_views(
+    clouds: Sequence[CubeCloud], transforms: Float32[np.ndarray, "b 3 4"], pixels: int
+) -> Float[Tensor, "b 3 7 h w"]:
+    """Each cloud's views after its transform."""
+    views = np.empty((len(clouds), len(THREE_VIEWS), len(CHANNELS), pixels, pixels), np.float32)
+    for cloud, transform, out in zip(clouds, transforms, views, strict=True):
+        render_views(cloud.xyz_in_cube, cloud.rgb, transform, pixels, out, THREE_VIEWS)
+    return torch.from_numpy(views)
 
 
 @dataclass(frozen=True)

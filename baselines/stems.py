@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.layers import LEAK, init_leaky, init_plain
-from baselines.views import CHANNELS, VIEWS
+from baselines.views import CHANNELS
 
 IMAGE_CHANNELS = len(CHANNELS) + 3
 """What is rendered, and three constant channels that say where a pixel lies."""
@@ -30,7 +30,7 @@ def with_locations(views: Float[Tensor, "b v 7 h w"]) -> Float[Tensor, "b v 10 h
     """Append view, row and column of each pixel, each from -1 to 1: RVT's constant channels
     (D-channels)."""
     b, v, _, h, w = views.shape
-    axes = [torch.linspace(-1, 1, steps, device=views.device) for steps in (len(VIEWS), h, w)]
+    axes = [torch.linspace(-1, 1, steps, device=views.device) for steps in (v, h, w)]
     places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=1).to(views.dtype)
     return torch.cat([views, places.expand(b, v, 3, h, w)], dim=2)
 

@@ -1,4 +1,4 @@
-"""Five orthographic virtual views of a point cloud (RVT section 3.1; paper section 3.2).
+"""Orthographic virtual views of a point cloud (RVT section 3.1; paper section 3.2).
 
 The cube [-1, 1]^3 is the scene. Each view looks along one axis from a face of the cube and shows
 it edge to edge, so image coordinates and depth are cube coordinates up to scale and sign: no
@@ -15,26 +15,46 @@ right   -x          h (1 - y)   h (1 - z)   1 + x
 Coordinates are continuous: pixel k covers [k, k + 1).
 """
 
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from functools import cache
+
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 
 from baselines.compiled import compiled
 from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
 
-VIEWS = ("top", "front", "back", "left", "right")
-"""Names and order of the views."""
+
+@dataclass(frozen=True)
+class View:
+    """How one view lies in the cube; axes are counted x, y, z."""
+
+    u_axis: int
+    u_sign: int
+    """Axis of the image's columns, and whether they run with it (1) or against it (-1)."""
+
+    v_axis: int
+    """Axis of the image's rows, which always run against it."""
+
+    depth_axis: int
+    side: int
+    """Axis the view looks along, and the side it looks from."""
+
+
+TOP, FRONT, BACK = View(0, 1, 1, 2, 1), View(0, -1, 2, 1, 1), View(0, 1, 2, 1, -1)
+LEFT, RIGHT = View(1, 1, 2, 0, 1), View(1, -1, 2, 0, -1)
+
+VIEWS = (TOP, FRONT, BACK, LEFT, RIGHT)
+"""RVT's five views in its order; those of one axis stand together, so they share their work."""
+
+THREE_VIEWS = (TOP, LEFT, FRONT)
+"""RVT-2's: one along each axis (it calls them top, front and right)."""
 
 CHANNELS = ("x", "y", "z", "red", "green", "blue", "depth")
 """Position in the cube frame, colour in [0, 1], depth less its mean over the view's points;
 pixel locations are not drawn (D-channels)."""
-
-U_AXIS, U_SIGN = (0, 0, 0, 1, 1), (1, -1, 1, 1, -1)
-V_AXIS = (1, 2, 2, 2, 2)
-"""Cube axes of image columns and rows; v always points against its axis."""
-
-DEPTH_AXIS, CAMERA_SIDE = (2, 1, 1, 0, 0), (1, 1, -1, 1, -1)
-"""Axis a view looks along and the side it looks from; views of one axis stand together."""
 
 EMPTY_DEPTH = -1.0
 """Depth where no point is seen; the other channels are 0 there."""
@@ -70,12 +90,12 @@ def base_from_cube(
 
 
 def project(
-    points_in_cube: Float[torch.Tensor, "*b 3"], pixels: int
-) -> Float[torch.Tensor, "*b 5 2"]:
+    points_in_cube: Float[torch.Tensor, "*b 3"], pixels: int, views: Sequence[View] = VIEWS
+) -> Float[torch.Tensor, "*b v 2"]:
     """Continuous pixel coordinates (u, v) of points in each view."""
-    signs = points_in_cube.new_tensor(U_SIGN)
-    u = 1 + signs * points_in_cube[..., list(U_AXIS)]
-    v = 1 - points_in_cube[..., list(V_AXIS)]
+    signs = points_in_cube.new_tensor([view.u_sign for view in views])
+    u = 1 + signs * points_in_cube[..., [view.u_axis for view in views]]
+    v = 1 - points_in_cube[..., [view.v_axis for view in views]]
     return torch.stack([u, v], dim=-1) * (pixels / 2)
 
 
@@ -84,47 +104,52 @@ def render_views(
     rgb: UInt8[np.ndarray, "n 3"],
     transform: Float32[np.ndarray, "3 4"],
     pixels: int,
-    out: Float32[np.ndarray, "5 7 h w"] | None = None,
-) -> Float32[np.ndarray, "5 7 h w"]:
-    """Draw the cloud into the five views; single-threaded, deterministic, without the GIL.
+    out: Float32[np.ndarray, "v 7 h w"] | None = None,
+    views: tuple[View, ...] = VIEWS,
+) -> Float32[np.ndarray, "v 7 h w"]:
+    """Draw the cloud into the views; single-threaded, deterministic, without the GIL.
 
     Args:
         xyz: points in any frame (m).
         rgb: their colours.
         transform: from that frame to the cube, augmentation included; points that land outside
-            [-1, 1]^3 or are not finite are dropped, so none at all gives five empty views.
+            [-1, 1]^3 or are not finite are dropped, so none at all gives empty views.
         pixels: side of each view.
         out: memory to draw into (a slice of a batch saves allocating it anew).
+        views: which views, in order.
     """
-    shape = (len(VIEWS), len(CHANNELS), pixels, pixels)
+    shape = (len(views), len(CHANNELS), pixels, pixels)
     if out is None:
         out = np.empty(shape, np.float32)
     if out.shape != shape or xyz.shape != rgb.shape:
         shapes = f"{xyz.shape}, {rgb.shape} into {out.shape}"
         raise ValueError(f"expected points (n, 3), colours (n, 3) into {shape}, came {shapes}")
-    _render(np.asarray(xyz, np.float32), rgb, np.asarray(transform, np.float32), out)
+    transform = np.asarray(transform, np.float32)
+    _render(np.asarray(xyz, np.float32), rgb, transform, _table(views), out)
     return out
 
 
+@cache
+def _table(views: tuple[View, ...]) -> Int64[np.ndarray, "v 5"]:
+    """The views as the compiled code reads them: one row each, fields in order."""
+    return np.array([astuple(view) for view in views], np.int64)
+
+
 @compiled
-def _render(xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, out: np.ndarray) -> None:
+def _render(
+    xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, table: np.ndarray, out: np.ndarray
+) -> None:
     pixels = out.shape[2]
     points = np.empty((len(xyz), 6), np.float32)
     cells = np.empty((len(xyz), 3), np.int32)
     count = _place(xyz, rgb, transform, pixels, points, cells)
     points, cells = points[:count], cells[:count]
     nearest = np.empty((pixels + 2, pixels + 2, 2), np.float64)
-    for k in range(len(U_AXIS)):
-        if k == 0 or DEPTH_AXIS[k] != DEPTH_AXIS[k - 1]:
-            _splat(points, cells, U_AXIS[k], V_AXIS[k], DEPTH_AXIS[k], nearest)
-        _paint(
-            points,
-            nearest[:, :, int(CAMERA_SIDE[k] < 0)],
-            DEPTH_AXIS[k],
-            CAMERA_SIDE[k],
-            U_SIGN[k],
-            out[k],
-        )
+    for k in range(len(table)):
+        u_axis, u_sign, v_axis, depth_axis, side = table[k]
+        if k == 0 or depth_axis != table[k - 1, 3]:
+            _splat(points, cells, u_axis, v_axis, depth_axis, nearest)
+        _paint(points, nearest[:, :, int(side < 0)], depth_axis, side, u_sign, out[k])
 
 
 @compiled

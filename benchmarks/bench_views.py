@@ -6,6 +6,7 @@ checked against plain torch versions of the same result, which are also timed.
 """
 
 import functools
+import itertools
 import os
 import statistics
 import time
@@ -66,8 +67,12 @@ def observe(pixels: int = 128, focal: float = 150.0) -> tuple[np.ndarray, ...]:
 
 
 def torch_views(
-    xyz: Float32[np.ndarray, "n 3"], rgb: np.ndarray, transform: np.ndarray, pixels: int
-) -> Float[torch.Tensor, "5 7 h w"]:
+    xyz: Float32[np.ndarray, "n 3"],
+    rgb: np.ndarray,
+    transform: np.ndarray,
+    pixels: int,
+    chosen: tuple[views.View, ...],
+) -> Float[torch.Tensor, "v 7 h w"]:
     """The same picture in torch: (depth, index) packed in one integer, scattered by minimum."""
     x, y, z = torch.from_numpy(xyz).unbind(-1)
     rows = torch.from_numpy(transform)
@@ -76,21 +81,24 @@ def torch_views(
     placed = placed[kept]
     features = torch.cat([placed, torch.from_numpy(rgb)[kept] / 255], dim=-1)
     cells = (pixels / 2 * (1 + placed) + 0.5).long()
-    return torch.stack([_torch_view(features, cells, k, pixels) for k in range(5)])
+    return torch.stack([_torch_view(features, cells, view, pixels) for view in chosen])
 
 
 def _torch_view(
-    features: Float[torch.Tensor, "n 6"], cells: Int64[torch.Tensor, "n 3"], k: int, pixels: int
+    features: Float[torch.Tensor, "n 6"],
+    cells: Int64[torch.Tensor, "n 3"],
+    view: views.View,
+    pixels: int,
 ) -> Float[torch.Tensor, "7 h w"]:
-    depth = 1 - views.CAMERA_SIDE[k] * features[:, views.DEPTH_AXIS[k]]
+    depth = 1 - view.side * features[:, view.depth_axis]
     keys = (depth.double() * 2**24).long() << 32 | torch.arange(len(depth))
     side = pixels + 2
-    first = cells[:, views.V_AXIS[k]] * side + cells[:, views.U_AXIS[k]]
+    first = cells[:, view.v_axis] * side + cells[:, view.u_axis]
     nearest = torch.full((side * side,), 2**62)
     for step in (0, 1, side, side + 1):
         nearest.scatter_reduce_(0, first + step, keys, "amin")
     nearest = nearest.view(side, side)[1:-1, 1:-1].flip(0)
-    nearest = nearest if views.U_SIGN[k] > 0 else nearest.flip(1)
+    nearest = nearest if view.u_sign > 0 else nearest.flip(1)
     seen: Bool[torch.Tensor, "h w"] = nearest < 2**62
     winner = torch.where(seen, nearest & (2**32 - 1), 0)
     seen_depth = depth[winner]
@@ -125,20 +133,23 @@ def report(label: str, fast: Callable[[], object], slow: Callable[[], object] | 
     print(f"  {label:38}{took:9.3f}{ratio}", flush=True)
 
 
-def time_views(label: str, xyz: np.ndarray, rgb: np.ndarray, pixels: int) -> None:
-    """Check and time the five views of one cloud under one augmentation."""
+def time_views(
+    label: str, xyz: np.ndarray, rgb: np.ndarray, pixels: int, chosen: tuple[views.View, ...]
+) -> None:
+    """Check and time some views of one cloud under one augmentation."""
     transform = draw_matrix(np.random.default_rng(0))
-    out = np.empty((5, 7, pixels, pixels), np.float32)
-    views.render_views(xyz, rgb, transform, pixels, out)
-    different = int((torch.from_numpy(out) != torch_views(xyz, rgb, transform, pixels)).sum())
+    out = np.empty((len(chosen), 7, pixels, pixels), np.float32)
+    views.render_views(xyz, rgb, transform, pixels, out, chosen)
+    expected = torch_views(xyz, rgb, transform, pixels, chosen)
+    different = int((torch.from_numpy(out) != expected).sum())
     covered = np.mean(out[:, 6] != views.EMPTY_DEPTH)
     print(
         f"{label}: {len(xyz)} points, {covered:.0%} covered, {different} values differ from torch"
     )
     report(
-        f"5 views of {pixels} px",
-        lambda: views.render_views(xyz, rgb, transform, pixels, out),
-        lambda: torch_views(xyz, rgb, transform, pixels),
+        f"{len(chosen)} views of {pixels} px",
+        lambda: views.render_views(xyz, rgb, transform, pixels, out, chosen),
+        lambda: torch_views(xyz, rgb, transform, pixels, chosen),
     )
 
 
@@ -179,9 +190,10 @@ def main() -> None:
     center, half = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2
     uniform = (center + rng.uniform(-half, half, (POINTS, 3))).astype(np.float32)
     colours = rng.integers(0, 256, uniform.shape, dtype=np.uint8)
-    for pixels in (128, 220):
-        time_views("table and boxes", scene.xyz_in_base[:POINTS], scene.rgb[:POINTS], pixels)
-        time_views("uniform in the cube, no order", uniform, colours, pixels)
+    for pixels, chosen in itertools.product((128, 220), (views.VIEWS, views.THREE_VIEWS)):
+        points = scene.xyz_in_base[:POINTS], scene.rgb[:POINTS]
+        time_views("table and boxes", *points, pixels, chosen)
+        time_views("uniform in the cube, no order", uniform, colours, pixels, chosen)
     for pixels in (128, 220):
         time_heatmaps(pixels)
 

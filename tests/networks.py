@@ -28,6 +28,7 @@ TINY: dict[str, Any] = {
     "lowered_channels": 16,
     "proprio_channels": 16,
     "head_hidden": (64, 64),
+    "convex_channels": 16,
     "width": 32,
     "heads": 2,
     "head_width": 16,

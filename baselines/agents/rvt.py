@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
@@ -31,6 +31,7 @@ from baselines.multiview import (
 )
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.sight import Views, ViewSight
+from baselines.stems import Maps
 from baselines.text import TextSpec
 
 
@@ -86,14 +87,27 @@ PAPER = RvtConfig(
 )
 
 
-class Rvt(Network):
-    """Multi-view transformer."""
+@dataclass(frozen=True)
+class Read:
+    """Visual tokens on their way through the transformer."""
+
+    alone: Float[Tensor, "b t d"]
+    """After the layers within each view, which know no words."""
+
+    joined: Float[Tensor, "b t d"]
+    """After the layers over all tokens and the words."""
+
+    skips: Maps
+    """What the stem keeps for the decoder."""
+
+
+class Transformer(nn.Module):
+    """RVT up to the tokens that its decoder reads."""
 
     def __init__(self, config: RvtConfig, text: TextSpec) -> None:
         """Fresh weights; `text` says how wide a token vector is."""
         super().__init__()
-        self.config = config
-        self.sight = ViewSight(config.pixels)
+        self.views = len(config.views)
         joined = config.stem_channels + config.proprio_channels
         self.encoder = ViewEncoder(config)
         self.proprio = NormedLinear(config.proprio_width, config.proprio_channels)
@@ -102,15 +116,14 @@ class Rvt(Network):
         self.lift = linear(joined, config.width)
         self.view_blocks = blocks(config.view_layers, config)
         self.joint_blocks = blocks(config.joint_layers, config)
-        self.action = ActionDecoder(config)
 
-    def forward(self, inputs: Inputs[Views]) -> ActionLogits:
-        """Logits of the next keyframe."""
-        tokens, skips = self.encoder(inputs.scene.views)
+    def read(self, views: Float[Tensor, "b v 7 h w"], inputs: Inputs) -> Read:
+        """Look at the views with the words and the proprioception of `inputs`."""
+        tokens, skips = self.encoder(views)
         proprio = self.proprio(inputs.proprio)[:, None].expand(-1, tokens.shape[1], -1)
         tokens = self.lift(torch.cat([tokens, proprio], dim=-1) + self.position)
-        tokens = within_views(self.view_blocks, tokens)
-        return self.action(self._with_words(tokens, inputs), skips)
+        alone = within_views(self.view_blocks, tokens, self.views)
+        return Read(alone=alone, joined=self._with_words(alone, inputs), skips=skips)
 
     def _with_words(self, tokens: Float[Tensor, "b t d"], inputs: Inputs) -> Float[Tensor, "b t d"]:
         """Joint self-attention of words and image tokens; the words are dropped after it."""
@@ -122,6 +135,22 @@ class Rvt(Network):
         for block in self.joint_blocks:
             joint = block(joint, bias)
         return joint[:, words.shape[1] :]
+
+
+class Rvt(Transformer, Network):
+    """Multi-view transformer."""
+
+    def __init__(self, config: RvtConfig, text: TextSpec) -> None:
+        """Fresh weights; `text` says how wide a token vector is."""
+        super().__init__(config, text)
+        self.config = config
+        self.sight = ViewSight(config.pixels)
+        self.action = ActionDecoder(config)
+
+    def forward(self, inputs: Inputs[Views]) -> ActionLogits:
+        """Logits of the next keyframe."""
+        read = self.read(inputs.scene.views, inputs)
+        return self.action(read.joined, read.skips)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning only."""

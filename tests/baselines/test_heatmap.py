@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from baselines.heatmap import SIGMA_PX, decode, target_heatmaps
-from baselines.views import project
+from baselines.views import BACK, THREE_VIEWS, TOP, VIEWS, project
 
+CHOICES = pytest.mark.parametrize(
+    "views", [VIEWS, THREE_VIEWS, (TOP, BACK)], ids=["five", "three", "two"]
+)
 CORNERS = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
@@ -22,20 +25,20 @@ def cell_centers(pixels):
     return torch.cartesian_prod(line, line, line)
 
 
-def brute_force_scores(logits):
+def brute_force_scores(logits, views=VIEWS):
     """Sum of log-softmaxes at every cell, read where `project` puts the cell's centre."""
     pixels = logits.shape[-1]
-    uv = project(cell_centers(pixels), pixels)
+    uv = project(cell_centers(pixels), pixels, views)
     u, v = (uv - 0.5).round().long().unbind(-1)
     heights = logits.double().flatten(-2).log_softmax(-1).unflatten(-1, (pixels, pixels))
-    return sum(heights[:, k, v[:, k], u[:, k]] for k in range(5))
+    return sum(heights[:, k, v[:, k], u[:, k]] for k in range(len(views)))
 
 
-def brute_force_decode(logits, reach=2):
+def brute_force_decode(logits, views, reach=2):
     """Best cell, then the weighted mean of the cells about it, each read from all scores."""
     pixels = logits.shape[-1]
     centers, points = cell_centers(pixels).double(), []
-    for scores in brute_force_scores(logits):
+    for scores in brute_force_scores(logits, views):
         best = torch.tensor(np.unravel_index(int(scores.argmax()), (pixels,) * 3))
         radius = torch.minimum(best, pixels - 1 - best).clamp(max=reach)
         cell = ((centers + 1) * pixels / 2 - 0.5).round().long()
@@ -44,31 +47,35 @@ def brute_force_decode(logits, reach=2):
     return torch.stack(points)
 
 
-def logits_of(points, pixels):
-    return (target_heatmaps(points, pixels) + 1e-9).log()
+def logits_of(points, pixels, views=VIEWS):
+    return (target_heatmaps(points, pixels, views=views) + 1e-9).log()
 
 
 @pytest.mark.parametrize("pixels", [16, 21])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 8.0])
-def test_decoding_equals_brute_force(pixels, scale):
-    noise = torch.randn(6, 5, pixels, pixels, generator=torch.Generator().manual_seed(pixels))
-    logits = scale * noise + logits_of(random_points(1, 6), pixels).clamp(min=-8)
+@CHOICES
+def test_decoding_equals_brute_force(pixels, scale, views):
+    generator = torch.Generator().manual_seed(pixels)
+    noise = torch.randn(6, len(views), pixels, pixels, generator=generator)
+    logits = scale * noise + logits_of(random_points(1, 6), pixels, views).clamp(min=-8)
     torch.testing.assert_close(
-        decode(logits).double(), brute_force_decode(logits), atol=1e-5, rtol=0
+        decode(logits, views).double(), brute_force_decode(logits, views), atol=1e-5, rtol=0
     )
 
 
-def test_best_cell_of_the_full_grid_is_found_in_noise():
-    logits = torch.randn(1, 5, 128, 128, generator=torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("views", [VIEWS, THREE_VIEWS], ids=["five", "three"])
+def test_best_cell_of_the_full_grid_is_found_in_noise(views):
+    logits = torch.randn(1, len(views), 128, 128, generator=torch.Generator().manual_seed(0))
     logits = 100 * logits  # so peaked that the mean is the best cell itself
-    best = cell_centers(128)[brute_force_scores(logits)[0].argmax()]
-    torch.testing.assert_close(decode(logits)[0], best, atol=1e-3, rtol=0)
+    best = cell_centers(128)[brute_force_scores(logits, views)[0].argmax()]
+    torch.testing.assert_close(decode(logits, views)[0], best, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("pixels", [64, 128, 220])
 @pytest.mark.parametrize("points", [CORNERS, random_points(0)], ids=["corners", "random"])
-def test_decoded_targets_lie_within_half_a_cell_diagonal(points, pixels):
-    error_px = (decode(logits_of(points, pixels)) - points).norm(dim=-1) * pixels / 2
+@pytest.mark.parametrize("views", [VIEWS, THREE_VIEWS], ids=["five", "three"])
+def test_decoded_targets_lie_within_half_a_cell_diagonal(points, pixels, views):
+    error_px = (decode(logits_of(points, pixels, views), views) - points).norm(dim=-1) * pixels / 2
     assert error_px.max() <= np.sqrt(3) / 2 + 1e-4
 
 
@@ -113,13 +120,15 @@ def test_decoding_carries_no_gradient_and_takes_other_layouts_and_types():
 
 @pytest.mark.parametrize("pixels", [32, 128])
 @pytest.mark.parametrize("points", [CORNERS, random_points(7, 8)], ids=["corners", "random"])
-def test_targets_equal_a_gaussian_evaluated_at_every_pixel_centre(points, pixels):
+@CHOICES
+def test_targets_equal_a_gaussian_evaluated_at_every_pixel_centre(points, pixels, views):
     line = torch.arange(pixels) + 0.5
-    u, v = project(points, pixels)[..., None, None].unbind(2)
+    u, v = project(points, pixels, views)[..., None, None].unbind(2)
     square = (line[None, :] - u).square() + (line[:, None] - v).square()
     heights = torch.exp(-square / (2 * SIGMA_PX**2)) * (square <= (3 * SIGMA_PX) ** 2)
     expected = heights / heights.sum(dim=(-2, -1), keepdim=True)
-    torch.testing.assert_close(target_heatmaps(points, pixels), expected, atol=1e-6, rtol=1e-4)
+    found = target_heatmaps(points, pixels, views=views)
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-4)
 
 
 def test_targets_sum_to_one_in_every_view():

@@ -7,8 +7,8 @@ from synthetic import observation
 
 from baselines.augment import Augmentation
 from baselines.cloud import point_maps, unproject
-from baselines.sight import CameraSight, Moment, ViewSight
-from baselines.views import apply_affine, cube_from_base
+from baselines.sight import CameraSight, Moment, ViewSight, ZoomSight
+from baselines.views import THREE_VIEWS, VIEWS, apply_affine, cube_from_base
 
 MOVE = Augmentation(0.6, np.array([0.05, -0.03, 0.02]))
 
@@ -48,14 +48,57 @@ def test_only_as_many_steps_as_asked_for_are_shown(episode):
     assert pictures.step.tolist() == [[3, 4]]
 
 
-@pytest.mark.parametrize("sight", [ViewSight(16), CameraSight(remembers=False)])
+@pytest.mark.parametrize(
+    "sight", [ViewSight(16), CameraSight(remembers=False), ZoomSight(16, draws=2)]
+)
 def test_rows_do_not_depend_on_each_other(episode, sight):
-    moments = [Moment(seen, MOVE) for seen in episode[:3]]
+    moments = [Moment(seen, MOVE, seed=i) for i, seen in enumerate(episode[:3])]
     together = sight.look(moments)
     for index, moment in enumerate(moments):
         alone = sight.look([moment])
         for name, value in vars(alone).items():
-            assert torch.equal(value, getattr(together, name)[index : index + 1])
+            expected = getattr(together, name)[index : index + 1]
+            assert torch.equal(value, expected) if name != "clouds" else same(value, expected)
+
+
+def same(clouds, others):
+    pairs = zip(clouds, others, strict=True)
+    return all(np.array_equal(a.xyz_in_cube, b.xyz_in_cube) for a, b in pairs)
+
+
+def test_a_zooming_sight_shows_the_views_of_the_plain_one(episode):
+    moments = [Moment(seen, MOVE) for seen in episode[:2]]
+    plain = ViewSight(24).look(moments).views
+    zooming = ZoomSight(24, draws=0).look(moments).views
+    assert torch.equal(zooming, plain[:, [VIEWS.index(view) for view in THREE_VIEWS]])
+
+
+def test_the_whole_cube_is_what_a_zoom_of_one_shows(episode):
+    scene = ZoomSight(24, draws=0).look([Moment(seen, MOVE) for seen in episode[:2]])
+    assert torch.equal(scene.closer(torch.zeros(2, 3), 1.0).views, scene.views)
+
+
+def test_a_zoom_draws_the_points_about_its_centre_larger(episode):
+    scene = ZoomSight(32, draws=0).look([Moment(episode[0], MOVE), Moment(episode[1], MOVE)])
+    centers = torch.tensor([[0.1, -0.2, -0.3], [0.3, 0.1, -0.5]])
+    near = scene.closer(centers, 4.0).views
+    for cloud, center, views in zip(scene.clouds, centers.numpy(), near, strict=True):
+        close = 4 * (cloud.xyz_in_cube.astype(float) - center)
+        inside = (np.abs(close) <= 1 - 1e-5).all(-1)
+        assert 20 < inside.sum() < len(inside) / 10
+        shown = views[:, :3].permute(0, 2, 3, 1)[views[:, 6] > -1].double().numpy()
+        assert np.abs(shown).max() <= 1
+        distances = np.abs(shown[:, None] - close[inside][None]).max(-1).min(1)
+        assert np.mean(distances < 1e-5) > 0.98  # the rest lie on the very border
+
+
+def test_random_choices_follow_the_seed(episode):
+    sight = ZoomSight(16, draws=3)
+    first, same_seed, other = (sight.look([Moment(episode[0], seed=s)]).draws for s in (1, 1, 2))
+    assert torch.equal(first, same_seed)
+    assert not torch.equal(first, other)
+    assert (first >= 0).all()
+    assert (first < 1).all()
 
 
 def test_the_gripper_moves_with_the_scene(episode):

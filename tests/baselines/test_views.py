@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from baselines.views import (
+    BACK,
     EMPTY_DEPTH,
+    FRONT,
+    LEFT,
+    RIGHT,
+    THREE_VIEWS,
+    TOP,
     VIEWS,
     apply_affine,
     base_from_cube,
@@ -20,6 +26,9 @@ from sacil_tasks.interface import SCENE_BOUNDS
 
 IDENTITY = np.eye(3, 4, dtype=np.float32)
 ONE = np.float32(1)
+CHOICES = pytest.mark.parametrize(
+    "views", [VIEWS, THREE_VIEWS, (BACK,)], ids=["five", "three", "one"]
+)
 
 
 def first_cells(value: np.float32, pixels: int, sign: int) -> tuple[int, int]:
@@ -29,28 +38,28 @@ def first_cells(value: np.float32, pixels: int, sign: int) -> tuple[int, int]:
     return pair if sign > 0 else (pixels - 1 - pair[0], pixels - 1 - pair[1])
 
 
-def image_place(name, point, pixels):
+def image_place(view, point, pixels):
     """Columns, rows and depth of a point, written out view by view."""
     x, y, z = point
     along = {
-        "top": (x, 1, y, ONE - z),
-        "front": (x, -1, z, ONE - y),
-        "back": (x, 1, z, ONE + y),
-        "left": (y, 1, z, ONE - x),
-        "right": (y, -1, z, ONE + x),
+        TOP: (x, 1, y, ONE - z),
+        FRONT: (x, -1, z, ONE - y),
+        BACK: (x, 1, z, ONE + y),
+        LEFT: (y, 1, z, ONE - x),
+        RIGHT: (y, -1, z, ONE + x),
     }
-    u, sign, v, depth = along[name]
+    u, sign, v, depth = along[view]
     return first_cells(u, pixels, sign), first_cells(v, pixels, -1), depth
 
 
-def reference_view(name, points, rgb, pixels):
+def reference_view(chosen, points, rgb, pixels):
     """One view drawn point by point, pixel by pixel."""
     view = np.zeros((7, pixels, pixels), np.float32)
     winner = {}
     for i, point in enumerate(points):
         if not (np.abs(point) <= 1).all():
             continue
-        columns, rows, depth = image_place(name, point, pixels)
+        columns, rows, depth = image_place(chosen, point, pixels)
         for pixel in [(r, c) for r in rows for c in columns]:
             inside = min(pixel) >= 0 and max(pixel) < pixels
             if inside and (pixel not in winner or depth < winner[pixel][0]):
@@ -64,9 +73,9 @@ def reference_view(name, points, rgb, pixels):
     return view
 
 
-def reference_views(points, rgb, pixels):
+def reference_views(points, rgb, pixels, views=VIEWS):
     with np.errstate(invalid="ignore"):
-        return np.stack([reference_view(name, points, rgb, pixels) for name in VIEWS])
+        return np.stack([reference_view(view, points, rgb, pixels) for view in views])
 
 
 def random_cloud(seed, count, reach=1.1):
@@ -77,10 +86,12 @@ def random_cloud(seed, count, reach=1.1):
 
 @pytest.mark.parametrize("pixels", [7, 16, 40])
 @pytest.mark.parametrize("count", [1, 20, 800])
-def test_views_equal_the_loop_over_points(pixels, count):
+@CHOICES
+def test_views_equal_the_loop_over_points(pixels, count, views):
     xyz, rgb = random_cloud(count + pixels, count)
     np.testing.assert_array_equal(
-        render_views(xyz, rgb, IDENTITY, pixels), reference_views(xyz, rgb, pixels)
+        render_views(xyz, rgb, IDENTITY, pixels, views=views),
+        reference_views(xyz, rgb, pixels, views),
     )
 
 
@@ -192,9 +203,18 @@ def test_arrays_that_do_not_fit_are_refused():
         render_views(xyz, rgb[:4], IDENTITY, 24)
 
 
+def test_three_views_are_three_of_the_five():
+    xyz, rgb = random_cloud(7, 4000)
+    five = render_views(xyz, rgb, IDENTITY, 40)
+    three = render_views(xyz, rgb, IDENTITY, 40, views=THREE_VIEWS)
+    np.testing.assert_array_equal(three, five[[VIEWS.index(view) for view in THREE_VIEWS]])
+
+
 def test_projection_follows_the_table_of_views():
     uv = project(torch.tensor([0.5, 0.25, -0.5]), 220)
     assert uv.tolist() == [[165, 82.5], [55, 165], [165, 165], [137.5, 165], [82.5, 165]]
+    three = project(torch.tensor([0.5, 0.25, -0.5]), 220, THREE_VIEWS)
+    assert three.tolist() == [[165, 82.5], [137.5, 165], [55, 165]]
 
 
 def test_cube_spans_the_scene_bounds():
