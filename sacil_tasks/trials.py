@@ -135,11 +135,11 @@ def expected_codes(spec: TaskSpec, asked: Slots, obeyed: Slots, played: int) -> 
             return ["SIZE_CONFUSION"]
         return ["ORDER_ERROR" if done != wanted else "RECEPTACLE_ERROR"]
     unfinished = ["MOTOR_FAIL", "NO_INTERACTION"]
+    if any(asked[name] != obeyed[name] for name in spec.receptacles):
+        unfinished.append("RECEPTACLE_ERROR")
     if done[0] not in wanted:
         return [*unfinished, "SIZE_CONFUSION"]
-    if done[0] != wanted[0]:
-        return [*unfinished, "ORDER_ERROR"]
-    return [*unfinished, "RECEPTACLE_ERROR"] if spec.receptacles else unfinished
+    return [*unfinished, "ORDER_ERROR"] if done[0] != wanted[0] else unfinished
 
 
 def play(stage: Stage, keyframe: Callable[[int], Any], count: int | None = None) -> str | None:
