@@ -179,8 +179,8 @@ def copy_demo(
 
 
 def _copy_chunks(source: h5py.Dataset, target: h5py.Dataset, start: int, first_row: int) -> None:
-    lengths, steps = source.shape[1:], source.chunks[1:]
-    for corner in product(*(range(0, *pair) for pair in zip(lengths, steps, strict=True))):
+    lengths = zip(source.shape[1:], source.chunks[1:], strict=True)
+    for corner in product(*(range(0, length, step) for length, step in lengths)):
         mask, chunk = source.id.read_direct_chunk((start, *corner))
         target.id.write_direct_chunk((first_row, *corner), chunk, mask)
 
