@@ -44,7 +44,7 @@ ENV_KWARGS: Mapping[str, Any] = {
 }
 """How the environment is made for a demo and for its replay."""
 
-_PART_SCHEMA = 1
+_PART_SCHEMA = 2
 
 
 StateTree = dict[str, Any]
@@ -151,7 +151,7 @@ def save_part(
         UsageError: the folder cannot be written or the disk is full.
     """
     with atomic_hdf5(demos.part(index)) as file:
-        create_tables(file, rows=len(keyframes.observations), episodes=1)
+        create_tables(file, episodes=1, demo_rows=len(keyframes.observations))
         write_demo(file, keyframes, episode_id=0, first_row=0)
         _write_trajectory(file.create_group("trajectory"), trajectory)
         file.attrs["record"] = json.dumps(record)
@@ -272,18 +272,17 @@ def _part_identity(demos: DemoSet, index: int) -> str:
 
 def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
     never = [False] * len(trajectory.actions)
-    group["actions"] = trajectory.actions
-    group["success"] = group["terminated"] = trajectory.success
-    group["fail"] = group["truncated"] = never
-    _write_states(group.create_group("env_states"), trajectory.states)
+    success, states = trajectory.success, trajectory.states
+    tree = {"actions": trajectory.actions, "success": success, "terminated": success}
+    _write_tree(group, tree | {"fail": never, "truncated": never, "env_states": states})
 
 
-def _write_states(group: h5py.Group, states: StateTree) -> None:
-    for name, branch in states.items():
+def _write_tree(group: h5py.Group, tree: StateTree) -> None:
+    for name, branch in tree.items():
         if isinstance(branch, dict):
-            _write_states(group.create_group(name), branch)
+            _write_tree(group.create_group(name), branch)
         else:
-            group[name] = branch
+            group.create_dataset(name, data=branch, compression="gzip", shuffle=True)
 
 
 def _merge_records(demos: DemoSet, count: int, merged: int) -> list[dict[str, Any]]:
@@ -305,7 +304,6 @@ def _merge_trajectories(demos: DemoSet, count: int, merged: int) -> str:
 
 
 def _merge_keyframes(demos: DemoSet, count: int, merged: int, *, demos_sha256: str) -> None:
-    rows = count * (task_spec(demos.task).keyframes + 1)
     meta = KeyframeMeta(
         **demos.identity,
         env_id=f"sacil_tasks:{env_id(demos.task)}",
@@ -313,7 +311,7 @@ def _merge_keyframes(demos: DemoSet, count: int, merged: int, *, demos_sha256: s
         demos_sha256=demos_sha256,
     )
     with atomic_hdf5(demos.keyframes) as file:
-        create_tables(file, rows=rows, episodes=count)
+        create_tables(file, episodes=count, demo_rows=task_spec(demos.task).keyframes + 1)
         first_row = 0
         for index in range(count):
             old = index < merged

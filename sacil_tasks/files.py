@@ -44,7 +44,10 @@ def atomic_hdf5(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.Fil
         UsageError: the folder cannot be written or the disk is full.
     """
     with atomic_path(path) as draft:
-        with h5py.File(path, mode, driver="core", backing_store=False) as file:
+        # The chunk index of before 1.10 takes 2 KB a dataset, more than most states of a demo.
+        with h5py.File(
+            path, mode, driver="core", backing_store=False, libver=("v110", "v110")
+        ) as file:
             yield file
             file.flush()
             image = file.id.get_file_image()

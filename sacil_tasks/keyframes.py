@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,7 +23,7 @@ from sacil_tasks.files import atomic_hdf5
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, Keyframe, Observation
 
 KIND = "sacil-keyframes"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 CANDIDATES = 3
 NO_ROW = -1
 
@@ -61,7 +62,11 @@ EPISODE_COLUMNS: Mapping[str, tuple[Any, tuple[int, ...]]] = {
 """Type and shape of one row of each dataset in `episodes/`."""
 
 IMAGE_COLUMNS = ("rgb", "depth_mm")
-"""Columns stored one compressed chunk a row, so that files are merged without unpacking."""
+"""Columns stored in compressed chunks of one demo, so that files are merged without unpacking."""
+
+_BAND = 8
+"""Image rows of a chunk. A chunk holds the same band of one camera's images throughout a demo: most
+of it stands still, and the images are near enough to each other for gzip's 32 KiB of memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,13 +112,13 @@ class KeyframeMeta:
 
 
 def write_keyframes(path: Path, demos: Sequence[KeyframeDemo], meta: KeyframeMeta) -> None:
-    """Write `demos` in the order given, atomically.
+    """Write `demos`, at least one and all with as many keyframes, in the order given, atomically.
 
     Raises:
         UsageError: the folder cannot be written or the disk is full.
     """
     with atomic_hdf5(path) as file:
-        create_tables(file, rows=sum(len(d.observations) for d in demos), episodes=len(demos))
+        create_tables(file, episodes=len(demos), demo_rows=len(demos[0].observations))
         first_row = 0
         for episode_id, demo in enumerate(demos):
             write_demo(file, demo, episode_id=episode_id, first_row=first_row)
@@ -121,22 +126,25 @@ def write_keyframes(path: Path, demos: Sequence[KeyframeDemo], meta: KeyframeMet
         seal(file, meta)
 
 
-def create_tables(group: h5py.Group, *, rows: int, episodes: int) -> None:
-    """Lay out empty `observations/` and `episodes/` datasets."""
+def create_tables(group: h5py.Group, *, episodes: int, demo_rows: int) -> None:
+    """Lay out empty `observations/` and `episodes/` datasets for demos of `demo_rows` rows each."""
     for name, (dtype, shape) in OBSERVATION_COLUMNS.items():
-        packing = _packing(shape) if name in IMAGE_COLUMNS else {}
-        group.create_dataset(f"observations/{name}", (rows, *shape), dtype, **packing)
+        packing = _packing(shape, demo_rows) if name in IMAGE_COLUMNS else {}
+        group.create_dataset(
+            f"observations/{name}", (episodes * demo_rows, *shape), dtype, **packing
+        )
     for name, (dtype, shape) in EPISODE_COLUMNS.items():
         group.create_dataset(f"episodes/{name}", (episodes, *shape), dtype)
 
 
-def _packing(shape: tuple[int, ...]) -> dict[str, Any]:
-    # Checksums turn a damaged chunk into an error instead of wrong pixels.
+def _packing(shape: tuple[int, ...], demo_rows: int) -> dict[str, Any]:
+    _, _, *rest = shape
     return {
-        "chunks": (1, *shape),
+        "chunks": (demo_rows, 1, _BAND, *rest),
         "compression": "gzip",
-        "compression_opts": 4,
+        "compression_opts": 6,
         "shuffle": True,
+        # Checksums turn a damaged chunk into an error instead of wrong pixels.
         "fletcher32": True,
     }
 
@@ -158,7 +166,7 @@ def copy_demo(
     for name in OBSERVATION_COLUMNS:
         column, into = source[f"observations/{name}"], target[f"observations/{name}"]
         if name in IMAGE_COLUMNS:
-            _copy_chunks(column, into, range(start, start + count), first_row)
+            _copy_chunks(column, into, start, first_row)
         else:
             into[first_row : first_row + count] = column[start : start + count]
     last = first_row + count
@@ -170,13 +178,11 @@ def copy_demo(
     return count
 
 
-def _copy_chunks(
-    source: h5py.Dataset, target: h5py.Dataset, rows: Sequence[int], first_row: int
-) -> None:
-    tail = (0,) * (source.ndim - 1)
-    for offset, row in enumerate(rows):
-        mask, chunk = source.id.read_direct_chunk((row, *tail))
-        target.id.write_direct_chunk((first_row + offset, *tail), chunk, mask)
+def _copy_chunks(source: h5py.Dataset, target: h5py.Dataset, start: int, first_row: int) -> None:
+    lengths = zip(source.shape[1:], source.chunks[1:], strict=True)
+    for corner in product(*(range(0, length, step) for length, step in lengths)):
+        mask, chunk = source.id.read_direct_chunk((start, *corner))
+        target.id.write_direct_chunk((first_row, *corner), chunk, mask)
 
 
 def _next_rows(first_row: int, count: int) -> list[int]:

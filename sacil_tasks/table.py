@@ -426,8 +426,7 @@ class SizedTableEnv(BaseEnv):
         sizes_asked = self._asked[:, : len(self.task.slots)]
         named = self._labels[:, None] == sizes_asked[..., None]
         self._targets = named.int().argmax(-1)
-        # They depend on the scene as it was reset and on the words, so they are forgotten here.
-        self._expert_plans: dict[tuple[int, ...], list[Keyframe]] = {}
+        self._expert_plans: dict[tuple[int, ...], list[Keyframe]] = {}  # depend on the words
         self._present = self._variant.present(named.any(1))
         self._unnamed = ~named.any(1) & self._present
 

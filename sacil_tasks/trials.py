@@ -61,7 +61,7 @@ def reset_row(stage: Stage, split: str, index: int) -> Row:
         "xy_m": np.round(xy_m, 6).tolist(),
         "yaw_rad": [round(env._start_pose(k)[1], 6) for k in range(len(xy_m))],  # noqa: SLF001
         "rgb": draw_geometry(seed).rgb.tolist(),
-        "ids": _segmentation_ids(env),
+        "ids": [min(numbers) for numbers in _segmentation_ids(env)],
         "shared": _flat(info) + _flat(env._get_obs_extra(info)),  # noqa: SLF001 -- no images here
     }
     if index < HELD_SEEDS:
@@ -135,11 +135,11 @@ def expected_codes(spec: TaskSpec, asked: Slots, obeyed: Slots, played: int) -> 
             return ["SIZE_CONFUSION"]
         return ["ORDER_ERROR" if done != wanted else "RECEPTACLE_ERROR"]
     unfinished = ["MOTOR_FAIL", "NO_INTERACTION"]
+    if any(asked[name] != obeyed[name] for name in spec.receptacles):
+        unfinished.append("RECEPTACLE_ERROR")
     if done[0] not in wanted:
         return [*unfinished, "SIZE_CONFUSION"]
-    if done[0] != wanted[0]:
-        return [*unfinished, "ORDER_ERROR"]
-    return [*unfinished, "RECEPTACLE_ERROR"] if spec.receptacles else unfinished
+    return [*unfinished, "ORDER_ERROR"] if done[0] != wanted[0] else unfinished
 
 
 def play(stage: Stage, keyframe: Callable[[int], Any], count: int | None = None) -> str | None:
@@ -154,27 +154,24 @@ def play(stage: Stage, keyframe: Callable[[int], Any], count: int | None = None)
 def pixels_by_label(env: SizedTableEnv) -> np.ndarray:
     """Visible pixels of the small, medium and large candidate in each view (views x labels)."""
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    ids: dict[str, list[int]] = {}
-    for number, thing in env.segmentation_id_map.items():
-        owner = getattr(thing, "articulation", None) or thing
-        ids.setdefault(owner.name, []).append(number)
+    ids = _segmentation_ids(env)
     counts = np.zeros((len(CAMERAS), len(LABELS)), dtype=int)
     for view, name in enumerate(CAMERAS):
         sensor = env.scene.sensors[name]
         sensor.capture()
         seen = sensor.get_obs(rgb=False, depth=False, position=False)["segmentation"].numpy()
-        for k, candidate in enumerate(env.candidates):
-            label = LABELS.index(env.candidate_labels[k])
-            counts[view, label] = np.isin(seen, ids[candidate.name]).sum()
+        for k, size_word in enumerate(env.candidate_labels):
+            label = LABELS.index(size_word)
+            counts[view, label] = np.isin(seen, ids[k]).sum()
     return counts
 
 
-def _segmentation_ids(env: SizedTableEnv) -> list[int]:
-    """Least segmentation id of each candidate's bodies."""
-    ids: dict[str, int] = {}
+def _segmentation_ids(env: SizedTableEnv) -> list[list[int]]:
+    """Segmentation ids of each candidate's bodies."""
+    ids: dict[str, list[int]] = {}
     for number, thing in env.segmentation_id_map.items():
         owner = getattr(thing, "articulation", None) or thing
-        ids[owner.name] = min(number, ids.get(owner.name, number))
+        ids.setdefault(owner.name, []).append(number)
     return [ids[candidate.name] for candidate in env.candidates]
 
 

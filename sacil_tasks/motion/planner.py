@@ -1,9 +1,8 @@
 """Collision-free joint paths to a pose, and their timing.
 
 First a straight line of the tool, then a straight joint segment, then OMPL's RRT-Connect
-(D-motion). Every
-plan is a function of its arguments alone: limits count iterations, never seconds, and every
-random stream starts anew with each plan.
+(D-motion). Every plan is a function of its arguments alone: limits count iterations, never
+seconds, and every random stream starts anew with each plan.
 """
 
 import atexit

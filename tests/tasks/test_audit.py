@@ -110,6 +110,9 @@ def test_every_mistake_has_one_code(task: str) -> None:
             named = set(spec.size_words(asked))
             assert (code == "SIZE_CONFUSION") == bool(set(spec.size_words(obeyed)) - named)
             assert expected_codes(spec, asked, obeyed, 0) == ["NO_INTERACTION"]
+            halfway = expected_codes(spec, asked, obeyed, spec.keyframes // 2)
+            elsewhere = any(asked[name] != obeyed[name] for name in spec.receptacles)
+            assert ("RECEPTACLE_ERROR" in halfway) == elsewhere, "its drawer may be open by then"
 
 
 def _episodes(small: int, large: int) -> list[dict]:

@@ -76,7 +76,7 @@ def _keyframe(rng: np.random.Generator) -> Keyframe:
 
 @pytest.fixture
 def demos() -> list[KeyframeDemo]:
-    return [make_demo(7, keyframes=2), make_demo(8, keyframes=3)]
+    return [make_demo(7, keyframes=3), make_demo(8, keyframes=3)]
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def path(tmp_path: Path, demos: list[KeyframeDemo]) -> Path:
 def test_observations_and_episodes_survive_a_round_trip(path, demos):
     with KeyframeFile.open(path) as file:
         assert file.meta == META
-        assert file.first_rows == [0, 3]
+        assert file.first_rows == [0, 4]
         for episode, demo in zip(file.episodes, demos, strict=True):
             assert vars(episode) | {"sizes_m": None} == vars(demo.episode) | {"sizes_m": None}
             np.testing.assert_array_equal(episode.sizes_m, demo.episode.sizes_m)
@@ -100,12 +100,12 @@ def test_observations_and_episodes_survive_a_round_trip(path, demos):
 def test_labels_stand_beside_the_observation_they_follow(path, demos):
     with KeyframeFile.open(path) as file:
         poses = file.column("keyframe_in_base")
-        assert file.column("next_index").tolist() == [1, 2, -1, 4, 5, 6, -1]
-        assert file.column("episode_id").tolist() == [0, 0, 0, 1, 1, 1, 1]
-        assert np.isnan(poses[[2, 6]]).all()
+        assert file.column("next_index").tolist() == [1, 2, 3, -1, 5, 6, 7, -1]
+        assert file.column("episode_id").tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+        assert np.isnan(poses[[3, 7]]).all()
         second = demos[1].keyframes[1]
-        np.testing.assert_allclose(poses[4], [*second.position_m, *second.quaternion_wxyz], 1e-6)
-        assert file.column("keyframe_open")[4] == second.gripper_open
+        np.testing.assert_allclose(poses[5], [*second.position_m, *second.quaternion_wxyz], 1e-6)
+        assert file.column("keyframe_open")[5] == second.gripper_open
         assert file.column("target_index").tolist() == [
             *demos[0].targets,
             -1,
@@ -118,10 +118,10 @@ def test_merging_packed_demos_equals_writing_them_together(path, demos, tmp_path
     parts = []
     for number, demo in enumerate(demos):
         parts.append(h5py.File(tmp_path / f"part{number}.h5", "w"))
-        create_tables(parts[-1], rows=len(demo.observations), episodes=1)
+        create_tables(parts[-1], episodes=1, demo_rows=4)
         write_demo(parts[-1], demo, episode_id=0, first_row=0)
     with h5py.File(tmp_path / "merged.h5", "w") as merged:
-        create_tables(merged, rows=7, episodes=2)
+        create_tables(merged, episodes=2, demo_rows=4)
         first_row = 0
         for number, part in enumerate(parts):
             first_row += copy_demo(part, merged, episode=0, episode_id=number, first_row=first_row)
@@ -133,7 +133,7 @@ def test_merging_packed_demos_equals_writing_them_together(path, demos, tmp_path
 def test_the_content_hash_depends_on_every_pixel_and_word(tmp_path, demos):
     hashes = set()
     for number, change in enumerate([_nothing, _one_pixel, _one_word]):
-        changed = [make_demo(7, keyframes=2), make_demo(8, keyframes=3)]
+        changed = [make_demo(7, keyframes=3), make_demo(8, keyframes=3)]
         change(changed[1])
         write_keyframes(tmp_path / f"{number}.h5", changed, META)
         with KeyframeFile.open(tmp_path / f"{number}.h5") as file:
@@ -184,7 +184,7 @@ def _shorten_episodes(file: h5py.File) -> None:
         (_truncate, "truncated or not HDF5"),
         (_replace_by_text, "truncated or not HDF5"),
         (_edit(lambda file: file.attrs.clear()), "not a keyframe file"),
-        (_edit(lambda file: file.attrs.modify("schema_version", 2)), "of schema version 2, not 1"),
+        (_edit(lambda file: file.attrs.modify("schema_version", 1)), "of schema version 1, not 2"),
         (_edit(_drop_column), "without observations/tcp_in_base"),
         (_edit(_shorten_episodes), "do not add up"),
         (_edit(lambda file: file.attrs.__delitem__("task")), "damaged"),
