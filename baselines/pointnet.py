@@ -79,10 +79,10 @@ class SetAbstraction(nn.Module):
         self.lift = nn.Linear(fan_in, fan_in, bias=not batch)
         self.neighbours = nn.Sequential(
             neighbour_norm(norm, fan_in),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Linear(fan_in, fan_in, bias=not batch),
             neighbour_norm(norm, fan_in),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Linear(fan_in, fan_out, bias=not batch),
             neighbour_norm(norm, fan_out),
         )

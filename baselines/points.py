@@ -36,6 +36,11 @@ FRACTION = 2**20
 PARENTS = 3
 """Coarse points that a finer one is interpolated from."""
 
+TAKEN = np.float32(-1)
+"""Gap of a point that has its place in the order."""
+
+LOW_BITS = 2**32 - 1
+
 COLUMNS = 9
 """Of a row of a cloud: position in the cube, colour (0 to 255), normal."""
 
@@ -200,9 +205,10 @@ def near_points(xyz: Float32[np.ndarray, "n 3"], pyramid: Pyramid) -> Int32[np.n
     With the farthest first, the first points are those that spread over the neighbourhood.
     """
     near = np.empty((sum(pyramid.stages), pyramid.neighbours), np.int32)
+    axes = np.ascontiguousarray(xyz.T)
     start, before = 0, pyramid.points
     for count, radius in zip(pyramid.stages, pyramid.radii, strict=True):
-        _first_in_balls(xyz, before, np.float32(radius**2), near[start : start + count])
+        _first_in_balls(axes, before, np.float32(radius**2), near[start : start + count])
         start, before = start + count, count
     return near
 
@@ -214,10 +220,11 @@ def nearest_three(
     dropped = pyramid.points - pyramid.stages[-1]
     parents = np.empty((dropped, PARENTS), np.int32)
     shares = np.empty((dropped, PARENTS), np.float32)
+    axes = np.ascontiguousarray(xyz.T)
     before = pyramid.points
     for count in pyramid.stages:
         part = slice(count - pyramid.stages[-1], before - pyramid.stages[-1])
-        _three_nearest(xyz, count, parents[part], shares[part])
+        _three_nearest(axes, count, parents[part], shares[part])
         before = count
     return parents, shares
 
@@ -296,21 +303,18 @@ def _means(rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
 
 @compiled
 def _farthest_first(xyz: np.ndarray, count: int) -> np.ndarray:
-    x, y, z = xyz
-    gaps = np.full(len(x), np.float32(np.inf))
-    order = np.empty(len(x), np.int32)
+    points = xyz.shape[1]
+    gaps = np.full(points, np.float32(np.inf))
+    order = np.empty(points, np.int32)
     latest = 0
     for taken in range(count):
         order[taken] = latest
-        px, py, pz = x[latest], y[latest], z[latest]
-        for i in range(len(x)):
-            gap = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
-            gaps[i] = min(gaps[i], gap)
-        gaps[latest] = -1
-        latest = np.argmax(gaps)
+        _shrink(xyz[0], xyz[1], xyz[2], latest, gaps)
+        gaps[latest] = TAKEN
+        latest = _widest(gaps.view(np.int32))
     rest = count
-    for i in range(len(x)):
-        if gaps[i] >= 0:
+    for i in range(points):
+        if gaps[i] != TAKEN:
             order[rest] = i
             rest += 1
     return order
@@ -319,13 +323,13 @@ def _farthest_first(xyz: np.ndarray, count: int) -> np.ndarray:
 @compiled
 def _first_in_balls(xyz: np.ndarray, before: int, squared: np.float32, near: np.ndarray) -> None:
     """Fill one stage's neighbourhoods; the first neighbour fills what is left over."""
-    candidates = min(before, len(xyz))
+    points = xyz.shape[1]
+    gaps = np.empty(min(before, points), np.float32)
     for row in range(len(near)):
-        centre = row % len(xyz)
-        px, py, pz = xyz[centre, 0], xyz[centre, 1], xyz[centre, 2]
+        _squared(xyz[0], xyz[1], xyz[2], row % points, gaps)
         found = 0
-        for i in range(candidates):
-            if (xyz[i, 0] - px) ** 2 + (xyz[i, 1] - py) ** 2 + (xyz[i, 2] - pz) ** 2 <= squared:
+        for i in range(len(gaps)):
+            if gaps[i] <= squared:
                 near[row, found] = i
                 found += 1
                 if found == near.shape[1]:
@@ -335,24 +339,62 @@ def _first_in_balls(xyz: np.ndarray, before: int, squared: np.float32, near: np.
 
 @compiled
 def _three_nearest(xyz: np.ndarray, count: int, parents: np.ndarray, shares: np.ndarray) -> None:
-    """Fill the parents of the points from `count` on among the first `count`."""
-    candidates = min(count, len(xyz))
-    best = np.empty(PARENTS, np.float32)
+    """Fill the parents of the points from `count` on among the first `count`.
+
+    Where there are fewer than three, the nearest is named again, with no share.
+    """
+    points = xyz.shape[1]
+    gaps = np.empty(min(count, points), np.float32)
     for row in range(len(parents)):
-        point = (count + row) % len(xyz)
-        px, py, pz = xyz[point, 0], xyz[point, 1], xyz[point, 2]
-        best[:] = np.inf
-        parents[row] = 0
-        for i in range(candidates):
-            gap = (xyz[i, 0] - px) ** 2 + (xyz[i, 1] - py) ** 2 + (xyz[i, 2] - pz) ** 2
-            if gap < best[2]:
-                slot = 2
-                while slot > 0 and gap < best[slot - 1]:
-                    best[slot], parents[row, slot] = best[slot - 1], parents[row, slot - 1]
-                    slot -= 1
-                best[slot], parents[row, slot] = gap, i
-        total = np.float32(0)
-        for slot in range(PARENTS):
-            shares[row, slot] = np.float32(1) / (np.sqrt(best[slot]) + np.float32(1e-8))
-            total += shares[row, slot]
-        shares[row] /= total
+        _squared(xyz[0], xyz[1], xyz[2], (count + row) % points, gaps)
+        key = np.int64(-1)
+        for rank in range(PARENTS):
+            key = _next_nearest(gaps.view(np.int32), key)
+            parent = key & LOW_BITS if rank < len(gaps) else parents[row, 0]
+            share = np.float32(1) / (np.sqrt(gaps[parent]) + np.float32(1e-8))
+            parents[row, rank] = parent
+            shares[row, rank] = share if rank < len(gaps) else np.float32(0)
+        shares[row] /= shares[row].sum()
+
+
+# The loops below are functions of contiguous arrays because LLVM then turns them into vector
+# instructions. The bits of floats that are not negative are integers of the same order, and with
+# the index beside them one minimum finds both; minima of integers vectorise, those of floats with
+# their index do not.
+
+
+@compiled
+def _squared(x: np.ndarray, y: np.ndarray, z: np.ndarray, point: int, gaps: np.ndarray) -> None:
+    """Squared distances from one point to as many first points as there are gaps."""
+    px, py, pz = x[point], y[point], z[point]
+    for i in range(len(gaps)):
+        gaps[i] = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
+
+
+@compiled
+def _shrink(x: np.ndarray, y: np.ndarray, z: np.ndarray, point: int, gaps: np.ndarray) -> None:
+    """Lower each point's squared gap to what is taken, now that `point` is."""
+    px, py, pz = x[point], y[point], z[point]
+    for i in range(len(gaps)):
+        gap = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
+        gaps[i] = min(gaps[i], gap)
+
+
+@compiled
+def _widest(bits: np.ndarray) -> int:
+    """Index of the greatest float, the first one of equals; `bits` are those of the floats."""
+    best = np.int64(-(2**63))
+    for i in range(len(bits)):
+        best = max(best, (np.int64(bits[i]) << 32) - i)
+    return -best & LOW_BITS
+
+
+@compiled
+def _next_nearest(bits: np.ndarray, after: int) -> int:
+    """The least key above `after`; a key is the float's bits, then its index."""
+    none = np.int64(2**63 - 1)
+    best = none
+    for i in range(len(bits)):
+        key = (np.int64(bits[i]) << 32) | i
+        best = min(best, key if key > after else none)
+    return best

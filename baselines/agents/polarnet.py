@@ -59,7 +59,7 @@ class PolarNetConfig:
     neighbours: int = 16
     """Points in a neighbourhood."""
 
-    stem_channels: int = 32
+    stem_channels: int = 24
     """Channels of a point; twice as many after each stage."""
 
     norm: Norm = "layer"
