@@ -30,7 +30,7 @@ def gathered(
     samples, points, _ = features.shape
     first = torch.arange(samples, dtype=index.dtype, device=index.device) * points
     flat = features.flatten(0, 1).index_select(0, (index + first[:, None, None]).flatten())
-    return flat.view(*index.shape, -1)
+    return flat.view(*index.shape, features.shape[-1])
 
 
 def interpolated(

@@ -5,7 +5,7 @@
            -> neighbours of every stage, so that the network only gathers and multiplies
 
 All of it happens before the augmentation, which moves the result rigidly: neighbours do not
-depend on where the scene is put.
+depend on where the scene is put (D-polarnet-crop).
 """
 
 from collections.abc import Sequence
@@ -171,9 +171,7 @@ class CloudSight:
 
 def visible(seen: Observation) -> Float32[np.ndarray, "n 9"]:
     """Every pixel inside the cube and above the table, as rows of position, colour and normal."""
-    maps, inside = point_maps(
-        seen.depth_mm, seen.intrinsics, seen.camera_in_base, cube_from_base()
-    )
+    maps, inside = point_maps(seen.depth_mm, seen.intrinsics, seen.camera_in_base, cube_from_base())
     floor = (TABLE_M - SCENE_BOUNDS.center_in_base[2]) / HALF_SIDE_M
     rows = np.empty((inside.sum(), COLUMNS), np.float32)
     return rows[: _collect(maps, inside, seen.rgb, np.float32(floor), rows)]
@@ -202,7 +200,8 @@ def farthest_first(xyz: Float32[np.ndarray, "n 3"], count: int) -> Int32[np.ndar
 def near_points(xyz: Float32[np.ndarray, "n 3"], pyramid: Pyramid) -> Int32[np.ndarray, "r k"]:
     """For each centre of each stage, the first points within its radius in the stage before.
 
-    With the farthest first, the first points are those that spread over the neighbourhood.
+    With the farthest first, the first points are those that spread over the neighbourhood
+    (D-polarnet-ball).
     """
     near = np.empty((sum(pyramid.stages), pyramid.neighbours), np.int32)
     axes = np.ascontiguousarray(xyz.T)
@@ -255,7 +254,8 @@ def _collect(
 
 @compiled
 def _normal(maps: np.ndarray, inside: np.ndarray, i: int, j: int, out: np.ndarray) -> None:
-    """Unit normal towards the camera from the pixel's neighbours; 0 where there is none."""
+    """Unit normal towards the camera from the pixel's neighbours; 0 where there is none
+    (D-polarnet-normals)."""
     height, width = inside.shape
     left = j - 1 if j > 0 and _smooth(maps, inside, i, j, i, j - 1) else j
     right = j + 1 if j + 1 < width and _smooth(maps, inside, i, j, i, j + 1) else j

@@ -84,7 +84,8 @@ class PolarNetConfig:
     """Weight of the heatmap's cross-entropy (D-polarnet-heat)."""
 
     position_weight: float = 100.0
-    """Weight of the squared position error in square metres (D-polarnet-weights)."""
+    """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
+    the quaternion's (D-polarnet-weights)."""
 
     recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", rotation_weight=100.0))
     """How to train."""
@@ -136,7 +137,7 @@ PAPER = PolarNetConfig(
     dropout=0.1,
     heat_weight=0.0,
     position_weight=1.0,
-    recipe=Recipe(
+    recipe=Recipe(  # D-polarnet-recipe
         samples=200_000 * 8 * 5,
         batch=40,
         choice_share=None,
@@ -183,7 +184,7 @@ class PolarNet(Network):
             for above, fine in zip(coarse, channels[:-1], strict=True)
         )
         self.heat = nn.Linear(channels[0], 4)
-        self.pose = nn.Sequential(
+        self.pose = nn.Sequential(  # D-polarnet-heads
             nn.Linear(coarse[-1], width * 3 // 2),
             nn.LeakyReLU(LEAK),
             nn.Linear(width * 3 // 2, 6),
