@@ -18,7 +18,7 @@ from torch import Tensor
 
 from baselines.cloud import point_maps
 from baselines.compiled import compiled
-from baselines.sight import Moment, gripper_in_cube
+from baselines.sight import STILL, Moment, gripper_in_cube
 from baselines.views import cube_from_base
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS, Observation
@@ -95,7 +95,7 @@ class PointCloud:
     xyz: Float[Tensor, "b n 3"]
     """From the gripper, in units of `reach`."""
 
-    look: Float[Tensor, "b n 7"]
+    features: Float[Tensor, "b n 7"]
     """Colour in [-1, 1], normal, height above the table (m)."""
 
     reach: Float[Tensor, "b"]
@@ -114,7 +114,7 @@ class PointCloud:
 
 
 class CloudSight:
-    """Merges, crops, thins and orders what the cameras saw; looks at no image."""
+    """Merges, crops, thins and orders what the cameras saw."""
 
     remembers = False
 
@@ -134,7 +134,7 @@ class CloudSight:
 
     def _cloud(self, moment: Moment) -> dict[str, np.ndarray]:
         """The fields of `PointCloud` for one moment."""
-        gripper = gripper_in_cube(moment.seen, Moment(moment.seen).move)[:3]
+        gripper = gripper_in_cube(moment.seen, STILL)[:3]
         voxels = average(visible(moment.seen), self.pyramid.voxel_m / HALF_SIDE_M)
         if not len(voxels):  # nothing to be seen: a black point where the gripper is
             voxels = np.zeros((1, COLUMNS), np.float32)
@@ -157,12 +157,12 @@ class CloudSight:
         pyramid, turn = self.pyramid, moment.move.matrix[:, :3].T.astype(np.float32)
         parents, shares = nearest_three(xyz, pyramid)
         height_m = voxels[:, 2:3] * HALF_SIDE_M + SCENE_BOUNDS.center_in_base[2]
-        look = np.hstack([voxels[:, 3:6] / 127.5 - 1, voxels[:, 6:] @ turn, height_m])
+        features = np.hstack([voxels[:, 3:6] / 127.5 - 1, voxels[:, 6:] @ turn, height_m])
         rows = np.arange(pyramid.points) % len(xyz)
         return {
             "xyz": (xyz @ turn)[rows],
-            "look": look.astype(np.float32)[rows],
-            "reach": reach,
+            "features": features.astype(np.float32)[rows],
+            "reach": np.asarray(reach),
             "near": near_points(xyz, pyramid),
             "parents": parents,
             "shares": shares,
@@ -281,7 +281,7 @@ def _smooth(maps: np.ndarray, inside: np.ndarray, i: int, j: int, row: int, colu
     squared = np.float32(0)
     for c in range(3):
         squared += (maps[c, row, column] - maps[c, i, j]) ** 2
-    return squared < np.float32((SMOOTH_M / HALF_SIDE_M) ** 2)
+    return bool(squared < np.float32((SMOOTH_M / HALF_SIDE_M) ** 2))
 
 
 @compiled
@@ -386,7 +386,7 @@ def _widest(bits: np.ndarray) -> int:
     best = np.int64(-(2**63))
     for i in range(len(bits)):
         best = max(best, (np.int64(bits[i]) << 32) - i)
-    return -best & LOW_BITS
+    return int(-best & LOW_BITS)
 
 
 @compiled
@@ -397,4 +397,4 @@ def _next_nearest(bits: np.ndarray, after: int) -> int:
     for i in range(len(bits)):
         key = (np.int64(bits[i]) << 32) | i
         best = min(best, key if key > after else none)
-    return best
+    return int(best)

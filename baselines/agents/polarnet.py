@@ -11,6 +11,7 @@ The preset `paper` is the published network (section 3 of that paper; 14,150,537
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -47,7 +48,9 @@ class PolarNetConfig:
     """Edge of the cells in which points are averaged (D-polarnet-voxel)."""
 
     points: int = 2048
-    """Points that enter the network."""
+    """Points that enter the network. With the arm at home the scenes of lifting and pushing have
+    900 to 1,500 voxels, and all of them enter; with the arm in view up to 7,600, and a block of
+    29 mm keeps 25 to 50 points, one of 50 mm 70 to 110."""
 
     stages: tuple[int, ...] = (512, 256, 128, 64)
     """Points that each stage of the encoder keeps."""
@@ -81,7 +84,7 @@ class PolarNetConfig:
     """Dropout in the transformer."""
 
     heat_weight: float = 1.0
-    """Weight of the heatmap's cross-entropy (D-polarnet-heat)."""
+    """Weight of the heatmap's divergence from its label (D-polarnet-heat)."""
 
     position_weight: float = 100.0
     """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
@@ -193,7 +196,7 @@ class PolarNet(Network):
     def forward(self, inputs: Inputs[PointCloud]) -> Guess:
         """What to do next."""
         cloud = inputs.scene
-        levels = [self.stem(torch.cat([cloud.xyz, cloud.look], dim=-1))]
+        levels = [self.stem(torch.cat([cloud.xyz, cloud.features], dim=-1))]
         for block, near in zip(self.encoder, cloud.near.split(self.config.stages, 1), strict=True):
             levels.append(block(levels[-1], cloud.xyz, near))
         fused = torch.cat([levels[-1], self.bottleneck(levels[-1], inputs)], dim=-1)
@@ -203,7 +206,7 @@ class PolarNet(Network):
     def _decoded(self, fused: Tensor, levels: list[Tensor], cloud: PointCloud) -> Tensor:
         """Features of all points: from the bottleneck back up."""
         sizes = (self.config.points, *self.config.stages)
-        dropped = [before - after for before, after in zip(sizes, sizes[1:], strict=False)][::-1]
+        dropped = [before - after for before, after in pairwise(sizes)][::-1]
         parents, shares = cloud.parents.split(dropped, 1), cloud.shares.split(dropped, 1)
         points = fused
         steps = zip(self.decoder[::-1], levels[::-1], parents, shares, strict=True)
@@ -228,7 +231,7 @@ class PolarNet(Network):
         error_m = (guess.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
         shared = grasp_error(guess.quaternion_wxyz, labels.quaternion_wxyz)
         terms = {
-            "bc/heat": functional.cross_entropy(guess.heat, heat_labels(batch.inputs, labels)),
+            "bc/heat": _divergence(guess.heat, heat_labels(batch.inputs, labels)),
             "bc/position": error_m.square().mean(),
             "bc/rotation": shared.mean() / 4,
             "bc/gripper": _binary(guess.gripper, labels.gripper_open),
@@ -317,6 +320,11 @@ def tool_axes(quaternion_wxyz: Float[Tensor, "b 4"]) -> Float[Tensor, "b 6"]:
         *(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
     )
     return torch.stack(axes, dim=-1)
+
+
+def _divergence(logits: Float[Tensor, "b n"], label: Float[Tensor, "b n"]) -> Tensor:
+    """Kullback-Leibler divergence: 0 where the heat is the label, mean over samples."""
+    return functional.kl_div(logits.log_softmax(-1), label, reduction="batchmean")
 
 
 def _binary(logit: Tensor, label: Tensor) -> Tensor:

@@ -148,11 +148,11 @@ def test_the_cloud_moves_as_the_scene_does(seen):
     in_base = places(before, still) * HALF_SIDE_M + np.array(SCENE_BOUNDS.center_in_base)
     expected = apply_affine(MOVE.to_cube(), in_base)
     np.testing.assert_allclose(places(after, moved), expected, atol=1e-5)
-    turned = before.look[0, :, 3:6].numpy() @ MOVE.matrix[:, :3].T
-    np.testing.assert_allclose(after.look[0, :, 3:6], turned, atol=1e-5)
+    turned = before.features[0, :, 3:6].numpy() @ MOVE.matrix[:, :3].T
+    np.testing.assert_allclose(after.features[0, :, 3:6], turned, atol=1e-5)
     for name in ("near", "parents", "shares", "reach"):
         assert torch.equal(getattr(before, name), getattr(after, name))
-    assert torch.equal(before.look[..., 6], after.look[..., 6])
+    assert torch.equal(before.features[..., 6], after.features[..., 6])
 
 
 def test_only_the_seed_draws_other_points(seen):
