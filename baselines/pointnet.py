@@ -92,10 +92,10 @@ class SetAbstraction(nn.Module):
     def forward(
         self,
         features: Float[Tensor, "b n c"],
-        xyz: Float[Tensor, "b n 3"],
+        xyz: Float[Tensor, "b p 3"],
         near: Int32[Tensor, "b m k"],
     ) -> Float[Tensor, "b m e"]:
-        """Features of the first `m` points from those of all."""
+        """Features of the first `m` points from those of `n`; `xyz` may go on after these."""
         count = near.shape[1]
         offsets = (gathered(xyz, near) - xyz[:, :count, None]) / self.radius
         said = self.neighbours(gathered(self.lift(features), near) + self.offset(offsets))
