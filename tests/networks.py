@@ -33,6 +33,9 @@ TINY: dict[str, Any] = {
     "heads": 2,
     "head_width": 16,
     "hidden": 32,
+    "points": 256,
+    "stages": (128, 64, 32, 16),
+    "neighbours": 8,
     "dropout": 0.0,
 }
 """Sizes by field name; a config takes those it has."""
