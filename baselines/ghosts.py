@@ -33,7 +33,7 @@ def _sequence(count: int) -> Float[Tensor, "1 n 3"]:
 
 
 def spread(rows: int, count: int) -> Float[Tensor, "1 n 3"]:
-    """The same even spread over the unit cube every time and for all rows."""
+    """The same even spread over the unit cube every time and for all rows (D-act3d-spread)."""
     del rows
     return _sequence(count)
 

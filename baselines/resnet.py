@@ -19,7 +19,7 @@ NORM_GROUPS = 32
 
 
 class ResNet50(nn.Module):
-    """Trained from scratch with group norm, or CLIP's weights and statistics as they are."""
+    """Trained from scratch with group norm, or CLIP's as it is (D-act3d-trunk)."""
 
     first_stride = 2
     """Pixels of a side of the finest map's cells; each further map doubles them."""

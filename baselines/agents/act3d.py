@@ -28,6 +28,7 @@ from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.layers import padding_bias
 from baselines.policy import KeyframePolicy, load_policy
+from baselines.regression import grasp_error
 from baselines.resnet import ResNet50
 from baselines.rotary import Context, Reader, Turns, turns
 from baselines.sight import CameraSight, Pictures
@@ -42,12 +43,12 @@ METRES = SCENE_BOUNDS.side_m / 2
 
 @dataclass(frozen=True, kw_only=True)
 class Act3dConfig:
-    """Sizes of Act3D; the defaults are the `cpu` preset."""
+    """Sizes of Act3D; the defaults are the `cpu` preset (D-act3d-size)."""
 
     trunk: Literal["small", "resnet50"] = "small"
     """Image trunk: `small`, for one core, or `resnet50`, CLIP's."""
 
-    trunk_channels: tuple[int, ...] = (32, 64, 96)
+    trunk_channels: tuple[int, ...] = (32, 64, 128)
     """Channels of the small trunk's maps at strides 4, 8, ..."""
 
     clip_weights: str = ""
@@ -71,6 +72,10 @@ class Act3dConfig:
     rotary_rad_per_m: float = 100.0
     """Fastest turn of the rotary code (D-act3d-rotary)."""
 
+    coarse_cells: int = 768
+    """Coarse cells that are read: those nearest to the centre of the cube. Of 1024, this is more
+    than lie in the cube, but for clutter (D-act3d-cells)."""
+
     fine_cells: int = 256
     """Fine cells that are read: those nearest to the guess."""
 
@@ -86,8 +91,10 @@ class Act3dConfig:
     label_spread_m: float = 0.01
     """Distance from the label at which a ghost's target falls by a factor e."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(rotation_weight=10.0, precision="bf16"))
-    """How to train."""
+    recipe: Recipe = field(
+        default_factory=lambda: Recipe(lr=3e-3, rotation_weight=10.0, precision="bf16")
+    )
+    """How to train (D-act3d-recipe)."""
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other.
@@ -117,6 +124,7 @@ PAPER = Act3dConfig(
     heads=4,
     blocks=2,
     rotary_rad_per_m=1.0,
+    coarse_cells=4096,
     fine_cells=4096,
     ghosts_learning=333,
     ghosts_acting=(3333, 3333, 3333),
@@ -173,7 +181,8 @@ class Detection:
     levels: list[Level]
 
     action: Float[Tensor, "b 6"]
-    """Unit quaternion wxyz, logits of gripper open and ignore collisions."""
+    """Quaternion wxyz of any length, logits of gripper open and ignore collisions
+    (D-act3d-collision)."""
 
 
 Place = Callable[[int, Float[Tensor, "b 3"]], Float[Tensor, "b g 3"]]
@@ -222,7 +231,8 @@ class Act3d(Network):
         levels: list[Level] = []
         for index in range(len(self.config.radii_m) + 1):
             if index == 0:  # the query is nowhere yet
-                context = self._context(coarse, inputs, words)
+                cells = coarse.nearest(guess, self.config.coarse_cells)
+                context = self._context(cells, inputs, words)
                 query = self.read_as_query(query, None, replace(context, code=None))
             else:
                 cells = fine.nearest(guess, self.config.fine_cells)
@@ -287,11 +297,13 @@ class Act3d(Network):
 
         found = self(batch.inputs, around_label)
         action, spread = found.action, config.label_spread_m / METRES
+        turn = functional.normalize(action[:, :4], dim=-1)
         flags = torch.stack([labels.gripper_open, labels.ignore_collisions], dim=1).float()
         binary = functional.binary_cross_entropy_with_logits
         terms = {
             "bc/position": detection_loss(found.levels, labels.position_in_cube, spread),
-            "bc/rotation": grip_loss(action[:, :4], labels.quaternion_wxyz),
+            # D-act3d-rotation: a mean square error, but q, -q and the twins are one grasp.
+            "bc/rotation": grasp_error(turn, labels.quaternion_wxyz).mean() / 4,
             "bc/gripper": binary(action[:, 4], flags[:, 0]),
             "bc/collision": binary(action[:, 5], flags[:, 1]),
         }
@@ -334,19 +346,6 @@ def detection_loss(
         distance = (level.ghosts_in_cube - position_in_cube[:, None]).norm(dim=-1)
         losses.append(functional.cross_entropy(level.scores, (-distance / spread).softmax(-1)))
     return torch.stack(losses).mean()
-
-
-def grip_loss(raw: Float[Tensor, "b 4"], label: Float[Tensor, "b 4"]) -> Tensor:
-    """Mean square error of unit quaternions, from the nearest that names the same grip.
-
-    q and -q are one orientation, and two parallel fingers cannot tell it from its twin, half a
-    turn about the tool z axis (D-act3d-rotation: the published loss knows neither).
-    """
-    w, x, y, z = label.unbind(-1)
-    twin = torch.stack([-z, y, -x, w], dim=-1)
-    unit = functional.normalize(raw, dim=-1)
-    alike = torch.stack([(unit * label).sum(-1), (unit * twin).sum(-1)]).abs().amax(0)
-    return (1 - alike).mean() / 2  # |a - b|^2 / 4 of unit vectors
 
 
 AGENT = AgentSpec(name="act3d", presets={"cpu": CPU, "paper": PAPER}, create=Act3d)
