@@ -63,11 +63,11 @@ class Act3dConfig:
     embedding: int = 96
     """Width of every token; a multiple of 6."""
 
-    heads: int = 3
+    heads: int = 6
     """Attention heads, of whole pairs of channels: moving the scene then changes no score."""
 
-    blocks: int = 1
-    """Blocks of each of the three attention modules."""
+    blocks: tuple[int, int, int] = (1, 1, 2)
+    """Blocks of the modules that read words, that read as ghosts, and that read as the query."""
 
     rotary_rad_per_m: float = 100.0
     """Fastest turn of the rotary code (D-act3d-rotary)."""
@@ -122,7 +122,7 @@ PAPER = Act3dConfig(
     output_kernel=3,
     embedding=120,
     heads=4,
-    blocks=2,
+    blocks=(2, 2, 2),
     rotary_rad_per_m=1.0,
     coarse_cells=4096,
     fine_cells=4096,
@@ -197,7 +197,7 @@ class Act3d(Network):
         super().__init__()
         self.config = config
         self.sight = CameraSight(remembers=False)
-        width, sizes = config.embedding, (config.embedding, config.heads, config.blocks)
+        width = config.embedding
         self.trunk: SmallTrunk | ResNet50
         if config.trunk == "small":
             self.trunk = SmallTrunk(config.trunk_channels)
@@ -208,9 +208,8 @@ class Act3d(Network):
         self.ghost = nn.Parameter(torch.randn(width))
         self.gripper = nn.Parameter(torch.randn(width))
         self.query = nn.Parameter(torch.randn(width))
-        self.read_words = Reader(*sizes)
-        self.read_as_ghost = Reader(*sizes)
-        self.read_as_query = Reader(*sizes)
+        readers = [Reader(width, config.heads, blocks) for blocks in config.blocks]
+        self.read_words, self.read_as_ghost, self.read_as_query = readers
         self.action = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6))
 
     def load_pretrained(self) -> None:
@@ -267,12 +266,11 @@ class Act3d(Network):
         gripper = self.gripper.expand(len(cells.tokens), 1, -1)
         tokens = self.read_words(torch.cat([cells.tokens, gripper], dim=1), None, words)
         hand, nowhere = inputs.gripper_in_cube[:, None, :3], torch.zeros_like(inputs.text[..., :3])
+        real = torch.cat([cells.seen, cells.seen.new_ones(len(tokens), 1), inputs.text_mask], dim=1)
         return Context(
             tokens=torch.cat([tokens, words.tokens], dim=1),
             code=self._code(torch.cat([cells.xyz_in_cube, hand, nowhere], dim=1)),
-            bias=torch.cat(
-                [padding_bias(functional.pad(cells.seen, (0, 1), value=True)), words.bias], dim=-1
-            ),
+            bias=padding_bias(real),
         )
 
     def _score(

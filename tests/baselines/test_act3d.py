@@ -70,9 +70,8 @@ def test_moving_everything_changes_no_score(network: Act3d) -> None:
     there = detect(network, shifted(inputs, shift), shift)
     for before, after in zip(here.levels, there.levels, strict=True):
         torch.testing.assert_close(after.ghosts_in_cube, before.ghosts_in_cube + shift)
-        spread = before.scores.std(dim=-1, keepdim=True)
-        assert ((after.scores - before.scores) / spread).abs().max() < 1e-4
         assert (after.scores - before.scores).abs().max() < 1e-5
+        assert before.scores.std(dim=-1).min() > 1e-2, "a ghost's place matters"
     torch.testing.assert_close(there.action, here.action, rtol=0, atol=1e-5)
 
 
