@@ -2,9 +2,10 @@
 
 Channels come in pairs. Each pair of a query or key is turned by an angle proportional to one
 coordinate of its point, so the product of a query and a key depends on where one point lies as
-seen from the other, and moving both changes nothing. The first third of the pairs stands for x,
-then come y and z; within a third the angles fall from `rad_per_m` radians a metre down to nearly
-a ten-thousandth of that.
+seen from the other, and moving both changes nothing. Three pairs in a row stand for x, y and z;
+from three to three the angles fall from `rad_per_m` radians a metre down to nearly a
+ten-thousandth of that. So every head knows all three directions, and the first heads are the
+near-sighted ones (D-act3d-heads).
 """
 
 from dataclasses import dataclass
@@ -31,9 +32,9 @@ class Turns:
 
 def turns(points_m: Float[Tensor, "b n 3"], width: int, rad_per_m: float) -> Turns:
     """Rotary code of points (m) for `width` channels, a multiple of 6."""
-    pairs = width // 6
-    falling = SPAN ** (-torch.arange(pairs, device=points_m.device) / pairs)
-    angles = (points_m.float()[..., None] * (rad_per_m * falling)).flatten(-2)
+    triples = width // 6
+    falling = SPAN ** (-torch.arange(triples, device=points_m.device) / triples)
+    angles = (points_m.float()[..., None, :] * (rad_per_m * falling)[:, None]).flatten(-2)
     return Turns(angles.cos(), angles.sin())
 
 
@@ -62,7 +63,7 @@ class RelativeAttention(nn.Module):
     """Multi-head cross-attention; queries and keys are turned, values are not."""
 
     def __init__(self, width: int, heads: int) -> None:
-        """Every head takes whole pairs of channels: `width` must be a multiple of 2 * `heads`."""
+        """Every head takes whole triples of pairs: `width` is a multiple of 6 * `heads`."""
         super().__init__()
         self.heads = heads
         self.to_q = linear(width, width)

@@ -61,10 +61,10 @@ class Act3dConfig:
     """Kernel of the pyramid's output convolutions."""
 
     embedding: int = 96
-    """Width of every token; a multiple of 6."""
+    """Width of every token."""
 
-    heads: int = 6
-    """Attention heads, of whole pairs of channels: moving the scene then changes no score."""
+    heads: int = 4
+    """Attention heads; each takes a multiple of 6 channels, a pair for each axis."""
 
     blocks: tuple[int, int, int] = (1, 1, 2)
     """Blocks of the modules that read words, that read as ghosts, and that read as the query."""
@@ -102,10 +102,10 @@ class Act3dConfig:
         Raises:
             UsageError: heads would split pairs, or a level lacks its ghosts or its ball.
         """
-        if self.embedding % 6 or self.embedding % (2 * self.heads):
+        if self.embedding % (6 * self.heads):
             raise UsageError(
-                f"an embedding of {self.embedding} is not a multiple of 6 and of twice the "
-                f"{self.heads} heads. Change --embedding or --heads."
+                f"an embedding of {self.embedding} does not give each of {self.heads} heads a "
+                "multiple of 6 channels. Change --embedding or --heads."
             )
         if len(self.ghosts_acting) != len(self.radii_m) + 1:
             raise UsageError(

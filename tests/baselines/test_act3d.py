@@ -194,7 +194,7 @@ def test_the_position_loss_is_least_for_scores_that_fall_with_distance() -> None
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"embedding": 64}, "multiple of 6"),
+        ({"embedding": 64}, "multiple of 6 channels"),
         ({"embedding": 60, "heads": 4}, "heads"),
         ({"ghosts_acting": (100, 100)}, "levels"),
     ],
