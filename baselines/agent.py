@@ -102,6 +102,12 @@ class Network(nn.Module):
     needs_goals: bool = False
     """Whether `loss` reads `Batch.goal`."""
 
+    def load_pretrained(self) -> None:
+        """Read weights made elsewhere, if there are any; called when a training run begins.
+
+        Checkpoints hold them, so a trained network never needs their files.
+        """
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The training loss, and its terms and diagnostics as detached scalars.
 

@@ -60,6 +60,7 @@ class Material:
         seed = self.job.options.seed
         torch.manual_seed(seed)
         network = self.identity.create()
+        network.load_pretrained()
         loader = Loader(
             self.keyframes,
             self.text,

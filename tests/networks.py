@@ -36,6 +36,8 @@ TINY: dict[str, Any] = {
     "points": 256,
     "stages": (128, 64, 32, 16),
     "neighbours": 8,
+    "embedding": 48,
+    "trunk_channels": (16, 16, 16),
     "dropout": 0.0,
 }
 """Sizes by field name; a config takes those it has."""

@@ -60,13 +60,13 @@ def test_presets_are_what_the_command_line_offers(name: str) -> None:
     assert {"cpu", "paper"} <= set(find_agent(name)[0].presets)
 
 
-def test_one_batch_can_be_overfitted(network: Network) -> None:
+def test_one_batch_can_be_overfitted(network: Network, config: Any) -> None:
     batch = batch_for(network, size=2)
     optimiser = Lamb(network, weight_decay=0.0)
     for step in range(100):
         loss, _ = network.loss(batch)
         loss.backward()
-        optimiser.step(0.02 * (1 - step / 100))
+        optimiser.step(3 * config.recipe.lr * (1 - step / 100))
     with torch.no_grad():
         found = network.eval().act(batch.inputs)
     labels = batch.labels

@@ -1,0 +1,85 @@
+"""Rotary codes: only where things lie relative to each other counts, in all three directions."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from baselines.layers import padding_bias
+from baselines.rotary import Context, Reader, RelativeAttention, turned, turns
+
+WIDTH, HEADS, RATE = 48, 4, 30.0
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+def context(tokens: Tensor, points_m: Tensor) -> Context:
+    everything = torch.ones(tokens.shape[:2], dtype=torch.bool)
+    return Context(tokens, turns(points_m, WIDTH, RATE), padding_bias(everything))
+
+
+def test_a_product_depends_on_the_displacement_alone() -> None:
+    q, k = torch.randn(1, 5, WIDTH), torch.randn(1, 7, WIDTH)
+    at, to, shift = torch.rand(1, 5, 3), torch.rand(1, 7, 3), torch.tensor([0.3, -0.2, 0.1])
+
+    def products(move: Tensor) -> Tensor:
+        codes = turns(at + move, WIDTH, RATE), turns(to + move, WIDTH, RATE)
+        return turned(q, codes[0]) @ turned(k, codes[1]).transpose(-1, -2)
+
+    torch.testing.assert_close(products(shift), products(torch.zeros(3)), rtol=0, atol=1e-4)
+    plain = q @ k.transpose(-1, -2)
+    assert (products(shift) - plain).abs().max() > 1
+    torch.testing.assert_close(turned(q, codes := turns(at, WIDTH, RATE)).norm(), q.norm())
+    assert codes.cos.shape == (1, 5, WIDTH // 2)
+
+
+def test_the_fastest_angle_is_the_rate() -> None:
+    code = turns(torch.tensor([[[0.02, 0.0, 0.0]]]), WIDTH, RATE)
+    angles = torch.atan2(code.sin, code.cos)[0, 0]
+    assert angles[0] == pytest.approx(0.02 * RATE)
+    assert angles[1] == angles[2] == 0  # y and z
+    assert (angles[0::3].diff() < 0).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_every_head_sees_every_axis(axis: int) -> None:
+    attention = RelativeAttention(WIDTH, HEADS)
+    attention.to_out = torch.nn.Identity()
+    x, tokens = torch.randn(1, 1, WIDTH), torch.randn(1, 6, WIDTH)
+    points = torch.rand(1, 6, 3)
+    moved = points.clone()
+    moved[0, 0, axis] += 10.0  # far enough for the slowest pairs to notice
+    code = turns(torch.zeros(1, 1, 3), WIDTH, RATE)
+    with torch.no_grad():
+        before = attention(x, code, context(tokens, points))
+        after = attention(x, code, context(tokens, moved))
+    changes = (after - before).unflatten(-1, (HEADS, -1)).abs().amax(dim=-1)
+    assert (changes > 1e-4).all()
+
+
+def test_a_diagonal_is_told_from_its_mirror_image() -> None:
+    # Both have the same coordinates on each axis alone.
+    tokens = torch.cat([torch.randn(1, 1, WIDTH).expand(1, 2, -1), torch.randn(1, 1, WIDTH)], 1)
+    rising = torch.tensor([[[0.05, 0.05, 0.0], [-0.05, -0.05, 0.0], [0.0, 0.0, 0.0]]])
+    falling = rising * torch.tensor([1.0, -1.0, 1.0])
+    reader = Reader(WIDTH, HEADS, blocks=1)
+    query, code = torch.randn(1, 1, WIDTH), turns(torch.zeros(1, 1, 3), WIDTH, RATE)
+    with torch.no_grad():
+        answers = [reader(query, code, context(tokens, points)) for points in (rising, falling)]
+    assert (answers[0] - answers[1]).abs().max() > 1e-3
+
+
+def test_padding_is_not_read() -> None:
+    tokens, points = torch.randn(1, 6, WIDTH), torch.rand(1, 6, 3)
+    real = torch.tensor([[True] * 4 + [False] * 2])
+    loud = torch.where(real[..., None], tokens, torch.tensor(50.0))
+    reader, query = Reader(WIDTH, HEADS, blocks=2), torch.randn(1, 3, WIDTH)
+    code = turns(torch.rand(1, 3, 3), WIDTH, RATE)
+    with torch.no_grad():
+        answers = [
+            reader(query, code, Context(t, turns(points, WIDTH, RATE), padding_bias(real)))
+            for t in (tokens, loud)
+        ]
+    assert torch.equal(*answers)
