@@ -32,6 +32,8 @@ TINY: dict[str, Any] = {
     "heads": 2,
     "head_width": 16,
     "hidden": 32,
+    "channels": (8, 8, 8, 8),
+    "pose_channels": 16,
     "dropout": 0.0,
 }
 """Sizes by field name; a config takes those it has."""
