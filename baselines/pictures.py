@@ -25,11 +25,12 @@ def gripper_map(gripper_px: Float[Tensor, "n k 2"], side: int) -> Float[Tensor, 
 def network_images(
     rgb: UInt8[Tensor, "n k h w 3"], gripper_px: Float[Tensor, "n k 2"]
 ) -> Float[Tensor, "m 4 h w"]:
-    """Colours in [-1, 1] and the gripper's map, camera after camera, channels last in memory."""
+    """Colours and the gripper's map in [-1, 1], camera after camera, channels last in memory."""
     n, k, side, _, _ = rgb.shape
     images = torch.empty((n, k, side, side, 4), device=rgb.device)
-    torch.sub(rgb / 127.5, 1, out=images[..., :3])
-    images[..., 3] = gripper_map(gripper_px, side)
+    images[..., :3] = rgb
+    images[..., 3] = 255 * gripper_map(gripper_px, side)
+    images = images.div_(127.5).sub_(1)
     return rearrange(images, "n k h w c -> (n k) c h w")
 
 
@@ -55,4 +56,4 @@ def mean_point(
     heat: Float[Tensor, "n k h w"], xyz_in_cube: Float[Tensor, "n k 3 h w"]
 ) -> Float[Tensor, "n 3"]:
     """Mean of the points under a heatmap."""
-    return torch.einsum("nkhw,nkchw->nc", heat, xyz_in_cube)
+    return (heat[:, :, None] * xyz_in_cube).sum((1, 3, 4))

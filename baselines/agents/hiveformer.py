@@ -61,7 +61,7 @@ class HiveFormerConfig:
     width: int = 128
     """Width of the transformer."""
 
-    heads: int = 4
+    heads: int = 2
     """Attention heads."""
 
     hidden: int = 256
@@ -163,9 +163,7 @@ class HiveFormer(Network):
         present = torch.zeros_like(scene.happened)
         present[:, -1] = True
         grid, skips, tokens = self._look(scene, present)
-        context, bias = self._context(inputs, self._remembered(scene, present, tokens))
-        for block in self.blocks:
-            tokens = block(tokens, context, bias)
+        tokens = self._informed(tokens, self._remembered(scene, present, tokens), inputs)
         added = rearrange(tokens, "b (k y x) d -> (b k) d y x", k=len(CAMERAS), y=self.config.grid)
         joined = torch.cat([grid, added.to(grid.dtype)], dim=1)
         return self._choose(scene, self.decoder(joined, skips), self.pose(joined))
@@ -188,18 +186,29 @@ class HiveFormer(Network):
             memory[past] = self._look(scene, past)[2]
         return memory
 
-    def _context(
-        self, inputs: Inputs[Pictures], memory: Float[Tensor, "b t p d"]
-    ) -> tuple[Float[Tensor, "b c d"], Float[Tensor, "b 1 1 c"]]:
-        """What the present step reads: the words and all steps, and which of it is padding.
-
-        D-hiveformer-masks: the published network reads the padding of short instructions.
-        """
+    def _informed(
+        self, tokens: Float[Tensor, "b p d"], memory: Float[Tensor, "b t p d"], inputs: Inputs
+    ) -> Float[Tensor, "b p d"]:
+        """Tokens of the present step after the transformer."""
         text, mask = trimmed_text(inputs)
         word_kind, visual_kind = self.kinds()
-        context = [self.words(text) + word_kind, memory.flatten(1, 2) + visual_kind]
-        happened = inputs.scene.happened.repeat_interleave(memory.shape[2], dim=1)
-        return torch.cat(context, dim=1), padding_bias(torch.cat([mask, happened], dim=1))
+        words, memory = self.words(text) + word_kind, memory + visual_kind
+        # D-hiveformer-masks: the published network reads the padding of short instructions.
+        bias = padding_bias(mask)
+        informed = torch.empty_like(tokens)
+        lengths = inputs.scene.happened.sum(1)
+        for steps in lengths.unique().tolist():  # padding short histories would double the cost
+            rows = lengths == steps
+            seen = memory[rows, -steps:].flatten(1, 2)
+            context = torch.cat([seen, words[rows]], dim=1)
+            scores = functional.pad(bias[rows], (seen.shape[1], 0))
+            informed[rows] = self._transformed(tokens[rows], context, scores)
+        return informed
+
+    def _transformed(self, tokens: Tensor, context: Tensor, bias: Tensor) -> Tensor:
+        for block in self.blocks:
+            tokens = block(tokens, context, bias)
+        return tokens
 
     def _choose(
         self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 9"]
