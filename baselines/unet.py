@@ -54,13 +54,15 @@ class UnetEncoder(nn.Module):
 class UnetDecoder(nn.Module):
     """Convolution, norm and bilinear up-sampling for each level."""
 
-    def __init__(self, grid_channels: int, levels: tuple[int, ...]) -> None:
-        """`levels` as in the encoder; `grid_channels` are those of the decoder's input."""
+    def __init__(self, grid_channels: int, levels: tuple[int, ...], fine_kernel: int) -> None:
+        """`levels` as in the encoder; `grid_channels` are those of the decoder's input and
+        `fine_kernel` is that of its last convolution but one; the others are 3x3."""
         super().__init__()
         coarse_first = levels[::-1]
         inputs = [grid_channels, *(a + b for a, b in pairwise(coarse_first))]
-        steps = zip(inputs, coarse_first, strict=True)
-        self.steps = nn.ModuleList(replicated(a, b) for a, b in steps)
+        kernels = [3] * (len(levels) - 1) + [fine_kernel]
+        steps = zip(inputs, coarse_first, kernels, strict=True)
+        self.steps = nn.ModuleList(replicated(*step) for step in steps)
         self.norms = nn.ModuleList(nn.GroupNorm(1, channels) for channels in coarse_first)
         self.heat = nn.Conv2d(coarse_first[-1], 1, 1)
 
@@ -70,8 +72,11 @@ class UnetDecoder(nn.Module):
         for step, norm, skip in zip(self.steps[1:], self.norms[1:], skips[::-1], strict=True):
             x = leaky(norm(over_both(step, doubled(x), skip)))
         # Published the other way round. A 1x1 convolution and an interpolation may change places,
-        # and on one channel the interpolation costs next to nothing.
-        return doubled(self.heat(x).float())[:, 0]
+        # and on one channel the interpolation is two small products.
+        heat = self.heat(x)[:, 0].float()
+        rows, columns = (doubling(side, heat.device) for side in heat.shape[1:])
+        with torch.autocast(heat.device.type, enabled=False):
+            return rows @ heat @ columns.T
 
 
 def replicated(fan_in: int, fan_out: int, kernel: int = 3, *, stride: int = 1) -> nn.Conv2d:
@@ -87,12 +92,20 @@ def over_both(
     Each map meets its own part of the weights: put side by side first, they would take half as
     long again, most of it on the way back through slices of the gradient.
     """
-    split = first.shape[1]
-    edged = [functional.pad(x, (1, 1, 1, 1), mode="replicate") for x in (first, second)]
-    one = functional.conv2d(edged[0], layer.weight[:, :split], layer.bias)
-    return one + functional.conv2d(edged[1], layer.weight[:, split:])
+    split, reach = first.shape[1], layer.kernel_size[0] // 2
+    if reach:
+        edge = (reach,) * 4
+        first, second = (functional.pad(x, edge, mode="replicate") for x in (first, second))
+    one = functional.conv2d(first, layer.weight[:, :split], layer.bias)
+    return one + functional.conv2d(second, layer.weight[:, split:])
 
 
 def doubled(x: Float[Tensor, "n c y x"]) -> Float[Tensor, "n c h w"]:
     """Bilinear up-sampling that keeps the corners in place."""
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+
+
+def doubling(side: int, device: torch.device) -> Float[Tensor, "double side"]:
+    """What `doubled` does along one axis, as a matrix."""
+    line = torch.eye(side, device=device)[None]
+    return functional.interpolate(line, size=2 * side, mode="linear", align_corners=True)[0].T

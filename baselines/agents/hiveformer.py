@@ -8,7 +8,8 @@
 The preset `paper` has the published sizes (section 3 of that paper); `cpu` keeps its steps at a
 size one core can train. The published network reads a whole episode at once; its single layer
 takes keys and values from the tokens as they were embedded, so only the present step needs
-queries and a decoder here, and earlier steps cost no more than their tokens.
+queries and a decoder here, and earlier steps cost no more than their tokens (D-hiveformer-steps).
+Images stay as they are when the recipe moves points, gripper and label (D-hiveformer-augment).
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -55,8 +56,11 @@ class HiveFormerConfig:
     stem: tuple[int, ...] = ()
     """Channels of the convolutions at full resolution."""
 
-    channels: tuple[int, int, int, int] = (16, 32, 64, 64)
+    channels: tuple[int, int, int, int] = (16, 16, 32, 64)
     """Channels at 1/2, 1/4, 1/8 and 1/16 of the resolution."""
+
+    fine_kernel: int = 1
+    """Kernel of the decoder's convolution at half the resolution."""
 
     width: int = 128
     """Width of the transformer."""
@@ -77,7 +81,7 @@ class HiveFormerConfig:
     """Dropout on attention probabilities and on what each part adds to a token."""
 
     position_weight: float = 100.0
-    """Weight of the squared position error in square metres."""
+    """Weight of the squared position error in square metres (D-hiveformer-recipe)."""
 
     recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", rotation_weight=1.0))
     """How to train."""
@@ -108,6 +112,7 @@ PAPER = HiveFormerConfig(
     window=MAX_KEYFRAMES,
     stem=(8, 16),
     channels=(16, 16, 16, 16),
+    fine_kernel=3,
     width=64,
     heads=8,
     hidden=64,
@@ -154,36 +159,53 @@ class HiveFormer(Network):
         self.kinds = NormedTable(2, config.width)
         self.blocks = nn.ModuleList(HistoryBlock(config) for _ in range(config.layers))
         joined = config.channels[-1] + config.width
-        self.decoder = UnetDecoder(joined, config.channels)
+        self.decoder = UnetDecoder(joined, config.channels, config.fine_kernel)
         self.pose = PoseHead(len(CAMERAS) * joined, config.pose_channels)
 
     def forward(self, inputs: Inputs[Pictures]) -> Choice:
         """The next keyframe."""
         scene = inputs.scene
-        present = torch.zeros_like(scene.happened)
-        present[:, -1] = True
-        grid, skips, tokens = self._look(scene, present)
-        tokens = self._informed(tokens, self._remembered(scene, present, tokens), inputs)
+        grid, skips, tokens = self._look(
+            scene.rgb[:, -1],
+            scene.gripper_px[:, -1],
+            scene.xyz_in_cube[:, -1],
+            scene.seen[:, -1],
+            scene.step[:, -1],
+        )
+        tokens = self._informed(tokens, self._remembered(scene, tokens), inputs)
         added = rearrange(tokens, "b (k y x) d -> (b k) d y x", k=len(CAMERAS), y=self.config.grid)
         joined = torch.cat([grid, added.to(grid.dtype)], dim=1)
         return self._choose(scene, self.decoder(joined, skips), self.pose(joined))
 
-    def _look(self, scene: Pictures, chosen: Bool[Tensor, "b t"]) -> tuple[Tensor, Maps, Tensor]:
-        """Grids and skips of each image, and tokens of each step, of `chosen` steps."""
-        images = network_images(scene.rgb.movedim(3, -1)[chosen], scene.gripper_px[chosen])
-        grid, skips = self.encoder(images)
-        points = pooled_points(scene.xyz_in_cube[chosen], scene.seen[chosen], self.config.grid)
-        return grid, skips, self.tokens(grid, points, scene.step[chosen])
+    def _look(
+        self,
+        rgb: UInt8[Tensor, "s k 3 h w"],
+        gripper_px: Float[Tensor, "s k 2"],
+        xyz_in_cube: Float[Tensor, "s k 3 h w"],
+        seen: Bool[Tensor, "s k h w"],
+        step: Float[Tensor, "s"],
+    ) -> tuple[Tensor, Maps, Tensor]:
+        """Grid and skips of each image, and the tokens of each step."""
+        grid, skips = self.encoder(network_images(rgb, gripper_px))
+        points = pooled_points(xyz_in_cube, seen, self.config.grid)
+        return grid, skips, self.tokens(grid, points, step)
 
     def _remembered(
-        self, scene: Pictures, present: Bool[Tensor, "b t"], tokens: Float[Tensor, "b p d"]
+        self, scene: Pictures, tokens: Float[Tensor, "b p d"]
     ) -> Float[Tensor, "b t p d"]:
         """Tokens of all steps; 0 at those that did not happen."""
-        memory = tokens.new_zeros(*present.shape, *tokens.shape[1:])
+        memory = tokens.new_zeros(*scene.happened.shape, *tokens.shape[1:])
         memory[:, -1] = tokens
-        past = scene.happened & ~present
+        past = scene.happened.clone()
+        past[:, -1] = False
         if past.any():
-            memory[past] = self._look(scene, past)[2]
+            memory[past] = self._look(
+                scene.rgb[past],
+                scene.gripper_px[past],
+                scene.xyz_in_cube[past],
+                scene.seen[past],
+                scene.step[past],
+            )[2]
         return memory
 
     def _informed(
@@ -192,14 +214,14 @@ class HiveFormer(Network):
         """Tokens of the present step after the transformer."""
         text, mask = trimmed_text(inputs)
         word_kind, visual_kind = self.kinds()
-        words, memory = self.words(text) + word_kind, memory + visual_kind
+        words = self.words(text) + word_kind
         # D-hiveformer-masks: the published network reads the padding of short instructions.
         bias = padding_bias(mask)
         informed = torch.empty_like(tokens)
         lengths = inputs.scene.happened.sum(1)
         for steps in lengths.unique().tolist():  # padding short histories would double the cost
             rows = lengths == steps
-            seen = memory[rows, -steps:].flatten(1, 2)
+            seen = memory[rows, -steps:].flatten(1, 2) + visual_kind
             context = torch.cat([seen, words[rows]], dim=1)
             scores = functional.pad(bias[rows], (seen.shape[1], 0))
             informed[rows] = self._transformed(tokens[rows], context, scores)
@@ -213,9 +235,7 @@ class HiveFormer(Network):
     def _choose(
         self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 9"]
     ) -> Choice:
-        heat = heat_over(
-            logits.unflatten(0, (-1, len(CAMERAS))), scene.seen[:, -1], TEMPERATURE
-        )
+        heat = heat_over(logits.unflatten(0, (-1, len(CAMERAS))), scene.seen[:, -1], TEMPERATURE)
         offset, quaternion, gripper, collision = pose.split(tuple(OUTPUTS.values()), dim=-1)
         return Choice(
             heat=heat,
@@ -373,7 +393,7 @@ def cloning_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Squared errors of position (m) and quaternion, cross-entropy of the two flags."""
     error_m = (choice.position_in_cube - labels.position_in_cube) * (SCENE_BOUNDS.side_m / 2)
-    # D-hiveformer-gripper: squared error of a sigmoid.
+    # D-hiveformer-flags: published as the squared error of a sigmoid.
     flag_loss = functional.binary_cross_entropy_with_logits
     terms = {
         "bc/position": error_m.square().sum(-1).mean(),
