@@ -59,18 +59,18 @@ class UnetDecoder(nn.Module):
         `fine_kernel` is that of its last convolution but one; the others are 3x3."""
         super().__init__()
         coarse_first = levels[::-1]
-        inputs = [grid_channels, *(a + b for a, b in pairwise(coarse_first))]
-        kernels = [3] * (len(levels) - 1) + [fine_kernel]
-        steps = zip(inputs, coarse_first, kernels, strict=True)
-        self.steps = nn.ModuleList(replicated(*step) for step in steps)
+        self.first = replicated(grid_channels, coarse_first[0])
+        kernels = [3] * (len(levels) - 2) + [fine_kernel]
+        pairs = zip(pairwise(coarse_first), kernels, strict=True)
+        self.merges = nn.ModuleList(Merge(a, b, kernel) for (a, b), kernel in pairs)
         self.norms = nn.ModuleList(nn.GroupNorm(1, channels) for channels in coarse_first)
         self.heat = nn.Conv2d(coarse_first[-1], 1, 1)
 
     def forward(self, grid: Float[Tensor, "n c y x"], skips: Maps) -> Float[Tensor, "n h w"]:
         """Logits of the heatmap."""
-        x = leaky(self.norms[0](self.steps[0](grid)))
-        for step, norm, skip in zip(self.steps[1:], self.norms[1:], skips[::-1], strict=True):
-            x = leaky(norm(over_both(step, doubled(x), skip)))
+        x = leaky(self.norms[0](self.first(grid)))
+        for merge, norm, skip in zip(self.merges, self.norms[1:], skips[::-1], strict=True):
+            x = leaky(norm(merge(doubled(x), skip)))
         # Published the other way round. A 1x1 convolution and an interpolation may change places,
         # and on one channel the interpolation is two small products.
         heat = self.heat(x)[:, 0].float()
@@ -84,20 +84,31 @@ def replicated(fan_in: int, fan_out: int, kernel: int = 3, *, stride: int = 1) -
     return convolution(fan_in, fan_out, kernel, stride=stride, padding_mode="replicate")
 
 
-def over_both(
-    layer: nn.Conv2d, first: Float[Tensor, "n a h w"], second: Float[Tensor, "n b h w"]
-) -> Float[Tensor, "n c h w"]:
-    """`layer` over the channels of both maps.
+class Merge(nn.Module):
+    """A convolution over a coarse map and a skip side by side, with the skip's channels out.
 
-    Each map meets its own part of the weights: put side by side first, they would take half as
-    long again, most of it on the way back through slices of the gradient.
+    Each map meets its own part of the weights: joined first they would take half as long again,
+    most of it on the way back through slices of the gradient.
     """
-    split, reach = first.shape[1], layer.kernel_size[0] // 2
-    if reach:
-        edge = (reach,) * 4
-        first, second = (functional.pad(x, edge, mode="replicate") for x in (first, second))
-    one = functional.conv2d(first, layer.weight[:, :split], layer.bias)
-    return one + functional.conv2d(second, layer.weight[:, split:])
+
+    def __init__(self, coarse: int, skip: int, kernel: int) -> None:
+        """Channels of both maps."""
+        super().__init__()
+        self.split, self.edge = coarse, kernel // 2
+        self.layer = replicated(coarse + skip, skip, kernel)
+
+    def forward(
+        self, coarse: Float[Tensor, "n a h w"], skip: Float[Tensor, "n b h w"]
+    ) -> Float[Tensor, "n b h w"]:
+        """What `layer` makes of both."""
+        first, second = self.layer.weight.split((self.split, skip.shape[1]), dim=1)
+        merged = functional.conv2d(self._edged(coarse), first, self.layer.bias)
+        return merged + functional.conv2d(self._edged(skip), second)
+
+    def _edged(self, x: Float[Tensor, "n c y x"]) -> Float[Tensor, "n c h w"]:
+        if not self.edge:
+            return x  # padding by nothing would still copy
+        return functional.pad(x, (self.edge,) * 4, mode="replicate")
 
 
 def doubled(x: Float[Tensor, "n c y x"]) -> Float[Tensor, "n c h w"]:

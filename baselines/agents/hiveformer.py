@@ -83,7 +83,7 @@ class HiveFormerConfig:
     position_weight: float = 100.0
     """Weight of the squared position error in square metres (D-hiveformer-recipe)."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", rotation_weight=1.0))
+    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16"))
     """How to train."""
 
     def __post_init__(self) -> None:

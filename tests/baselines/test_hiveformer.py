@@ -1,11 +1,12 @@
 """HiveFormer's published size, what it remembers, and how it reads a position off its heatmap."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from networks import TEXT, make_inputs, tiny
+from networks import TEXT, gradients, make_inputs, tiny
 from synthetic import observation
 from torch.nn import functional
 
@@ -14,7 +15,7 @@ from baselines.batch import Inputs
 from baselines.pictures import gripper_map, heat_over, mean_point, network_images, pooled_points
 from baselines.sight import Moment
 from baselines.text import TextSpec
-from baselines.unet import UnetDecoder, doubled, doubling, over_both, replicated
+from baselines.unet import Merge, UnetDecoder, doubled, doubling, replicated
 from sacil_tasks.errors import UsageError
 
 PUBLISHED = {
@@ -59,6 +60,12 @@ def answer(network: HiveFormer, inputs: Inputs) -> torch.Tensor:
     with torch.no_grad():
         found = network.act(inputs)
     return torch.cat([found.position_in_cube, found.quaternion_wxyz], dim=-1)
+
+
+def encoder_gradient(network: HiveFormer, inputs: Inputs) -> torch.Tensor:
+    network.zero_grad()
+    network(inputs).position_in_cube.sum().backward()
+    return gradients(network)["encoder.steps.0.weight"]
 
 
 def test_the_paper_preset_has_the_published_number_of_parameters() -> None:
@@ -117,13 +124,9 @@ def test_gradients_reach_the_encoder_through_the_past(network: HiveFormer, episo
     blank = replace(
         scene, rgb=torch.cat([scene.rgb[:, :1], torch.zeros_like(scene.rgb[:, 1:])], dim=1)
     )
-    network(replace(inputs, scene=blank)).position_in_cube.sum().backward()
-    weight = network.encoder.steps[0].weight
-    with_past = weight.grad.clone()
-    weight.grad = None
     alone = replace(blank, happened=torch.tensor([[False, True]]))
-    network(replace(inputs, scene=alone)).position_in_cube.sum().backward()
-    assert not torch.allclose(with_past, weight.grad)
+    before, after = (encoder_gradient(network, replace(inputs, scene=s)) for s in (blank, alone))
+    assert not torch.allclose(before, after)
 
 
 def test_a_certain_pixel_gives_its_point_and_unseen_pixels_never_win() -> None:
@@ -173,12 +176,12 @@ def test_cells_hold_the_mean_of_the_points_they_show() -> None:
     torch.testing.assert_close(pooled[1, 2, :, 1, 0], shown.mean(-1))
 
 
-def test_one_convolution_over_two_maps_is_that_of_both_side_by_side() -> None:
-    layer = replicated(5, 4)
-    first, second = torch.randn(2, 3, 6, 6), torch.randn(2, 2, 6, 6)
-    torch.testing.assert_close(
-        over_both(layer, first, second), layer(torch.cat([first, second], dim=1))
-    )
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_maps_that_are_merged_meet_the_same_weights_as_side_by_side(kernel: int) -> None:
+    merge = Merge(3, 2, kernel)
+    coarse, skip = torch.randn(2, 3, 6, 6), torch.randn(2, 2, 6, 6)
+    expected = merge.layer(torch.cat([coarse, skip], dim=1))
+    torch.testing.assert_close(merge(coarse, skip), expected)
 
 
 def test_the_decoder_may_enlarge_after_its_last_convolution() -> None:
@@ -197,6 +200,6 @@ def test_edges_are_continued() -> None:
 @pytest.mark.parametrize(
     ("change", "words"), [({"heads": 3}, "multiple of --heads"), ({"window": 0}, "present step")]
 )
-def test_sizes_that_do_not_fit_are_refused(change: dict[str, int], words: str) -> None:
+def test_sizes_that_do_not_fit_are_refused(change: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         replace(HiveFormerConfig(), **change)
