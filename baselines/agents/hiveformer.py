@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -31,7 +31,7 @@ from baselines.regression import grasp_error
 from baselines.sight import CameraSight, Pictures
 from baselines.stems import leaky
 from baselines.text import TextSpec
-from baselines.unet import Maps, UnetDecoder, UnetEncoder, replicated
+from baselines.unet import UnetDecoder, UnetEncoder, replicated
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, SCENE_BOUNDS
 
@@ -52,6 +52,9 @@ class HiveFormerConfig:
 
     window: int = 8
     """Steps that are remembered, the present one included; 1 forgets everything."""
+
+    past_gradients: bool = False
+    """Whether the encoder also learns from what it shows of earlier steps (D-hiveformer-past)."""
 
     stem: tuple[int, ...] = ()
     """Channels of the convolutions at full resolution."""
@@ -110,6 +113,7 @@ CPU = HiveFormerConfig()
 
 PAPER = HiveFormerConfig(
     window=MAX_KEYFRAMES,
+    past_gradients=True,
     stem=(8, 16),
     channels=(16, 16, 16, 16),
     fine_kernel=3,
@@ -165,30 +169,13 @@ class HiveFormer(Network):
     def forward(self, inputs: Inputs[Pictures]) -> Choice:
         """The next keyframe."""
         scene = inputs.scene
-        grid, skips, tokens = self._look(
-            scene.rgb[:, -1],
-            scene.gripper_px[:, -1],
-            scene.xyz_in_cube[:, -1],
-            scene.seen[:, -1],
-            scene.step[:, -1],
-        )
+        grid, skips = self.encoder(network_images(scene.rgb[:, -1], scene.gripper_px[:, -1]))
+        present = (scene.xyz_in_cube[:, -1], scene.seen[:, -1], scene.step[:, -1])
+        tokens = self.tokens(grid, *present)
         tokens = self._informed(tokens, self._remembered(scene, tokens), inputs)
         added = rearrange(tokens, "b (k y x) d -> (b k) d y x", k=len(CAMERAS), y=self.config.grid)
         joined = torch.cat([grid, added.to(grid.dtype)], dim=1)
         return self._choose(scene, self.decoder(joined, skips), self.pose(joined))
-
-    def _look(
-        self,
-        rgb: UInt8[Tensor, "s k 3 h w"],
-        gripper_px: Float[Tensor, "s k 2"],
-        xyz_in_cube: Float[Tensor, "s k 3 h w"],
-        seen: Bool[Tensor, "s k h w"],
-        step: Float[Tensor, "s"],
-    ) -> tuple[Tensor, Maps, Tensor]:
-        """Grid and skips of each image, and the tokens of each step."""
-        grid, skips = self.encoder(network_images(rgb, gripper_px))
-        points = pooled_points(xyz_in_cube, seen, self.config.grid)
-        return grid, skips, self.tokens(grid, points, step)
 
     def _remembered(
         self, scene: Pictures, tokens: Float[Tensor, "b p d"]
@@ -199,13 +186,11 @@ class HiveFormer(Network):
         past = scene.happened.clone()
         past[:, -1] = False
         if past.any():
-            memory[past] = self._look(
-                scene.rgb[past],
-                scene.gripper_px[past],
-                scene.xyz_in_cube[past],
-                scene.seen[past],
-                scene.step[past],
-            )[2]
+            with torch.set_grad_enabled(torch.is_grad_enabled() and self.config.past_gradients):
+                grid, _ = self.encoder(network_images(scene.rgb[past], scene.gripper_px[past]))
+            memory[past] = self.tokens(
+                grid, scene.xyz_in_cube[past], scene.seen[past], scene.step[past]
+            )
         return memory
 
     def _informed(
@@ -303,10 +288,12 @@ class VisualTokens(nn.Module):
     def forward(
         self,
         grid: Float[Tensor, "m c y x"],
-        points: Float[Tensor, "n k 3 y x"],
+        xyz_in_cube: Float[Tensor, "n k 3 h w"],
+        seen: Bool[Tensor, "n k h w"],
         step: Float[Tensor, "n"],
     ) -> Float[Tensor, "n p d"]:
         """Tokens of each step, camera after camera, row after row."""
+        points = pooled_points(xyz_in_cube, seen, grid.shape[-1])
         features = torch.cat([grid, points.flatten(0, 1).to(grid.dtype)], dim=1)
         cells = rearrange(features, "(n k) c y x -> n k (y x) c", k=len(CAMERAS))
         places = self.cell() + self.camera()[:, None]
