@@ -67,6 +67,16 @@ def gripper_in_cube(seen: Observation, move: Augmentation) -> Float32[np.ndarray
     return np.concatenate([position, pose[3:]]).astype(np.float32)
 
 
+def gripper_px(seen: Observation) -> Float32[np.ndarray, "k 2"]:
+    """Column and row at which each camera sees the gripper's position; -inf behind the camera."""
+    rotation, origin = seen.camera_in_base[:, :3, :3], seen.camera_in_base[:, :3, 3]
+    in_camera = np.einsum("kij,ki->kj", rotation, seen.tcp_in_base[:3] - origin)
+    u, v, depth = np.einsum("kij,kj->ik", seen.intrinsics, in_camera)
+    ahead = depth > 0
+    scale = 1 / np.where(ahead, depth, 1)
+    return np.where(ahead, [u * scale, v * scale], -np.inf).T.astype(np.float32)
+
+
 @dataclass(frozen=True)
 class Views:
     """Virtual views of the merged cloud."""
@@ -182,6 +192,10 @@ class Pictures:
     gripper_in_cube: Float[Tensor, "b t 7"]
     """Position in the cube, quaternion wxyz."""
 
+    gripper_px: Float[Tensor, "b t k 2"]
+    """Where in each image the gripper's position is: column, row; pixel j covers [j, j + 1).
+    -inf behind the camera and at steps that did not happen."""
+
     happened: Bool[Tensor, "b t"]
     """False at steps that only pad."""
 
@@ -209,12 +223,14 @@ class CameraSight:
 
 
 def _blank(rows: int, steps: int) -> Pictures:
-    images = (rows, steps, len(CAMERAS), 3, IMAGE_PIXELS, IMAGE_PIXELS)
+    frames, side = (rows, steps, len(CAMERAS)), IMAGE_PIXELS
+    # In memory colours come last, as the cameras give them and as convolutions like them.
     return Pictures(
-        rgb=torch.zeros(images, dtype=torch.uint8),
-        xyz_in_cube=torch.zeros(images),
-        seen=torch.zeros((*images[:3], *images[4:]), dtype=torch.bool),
+        rgb=torch.zeros((*frames, side, side, 3), dtype=torch.uint8).movedim(-1, 3),
+        xyz_in_cube=torch.zeros((*frames, 3, side, side)),
+        seen=torch.zeros((*frames, side, side), dtype=torch.bool),
         gripper_in_cube=torch.zeros((rows, steps, 7)),
+        gripper_px=torch.full((*frames, 2), -torch.inf),
         happened=torch.zeros((rows, steps), dtype=torch.bool),
         step=torch.zeros((rows, steps)),
     )
@@ -228,5 +244,6 @@ def _fill(pictures: Pictures, row: int, t: int, seen: Observation, move: Augment
     pictures.xyz_in_cube[row, t] = torch.from_numpy(xyz_in_cube)
     pictures.seen[row, t] = torch.from_numpy(inside)
     pictures.gripper_in_cube[row, t] = torch.from_numpy(gripper_in_cube(seen, move))
+    pictures.gripper_px[row, t] = torch.from_numpy(gripper_px(seen))
     pictures.happened[row, t] = True
     pictures.step[row, t] = seen.step

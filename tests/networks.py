@@ -38,6 +38,8 @@ TINY: dict[str, Any] = {
     "neighbours": 8,
     "embedding": 48,
     "trunk_channels": (16, 16, 16),
+    "channels": (8, 8, 8, 8),
+    "pose_channels": 16,
     "dropout": 0.0,
 }
 """Sizes by field name; a config takes those it has."""

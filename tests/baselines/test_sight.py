@@ -1,5 +1,7 @@
 """What networks read of a scene: every pixel in its place, and the past in its order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from synthetic import observation
 
 from baselines.augment import Augmentation
 from baselines.cloud import point_maps, unproject
-from baselines.sight import CameraSight, Moment, ViewSight, ZoomSight
+from baselines.sight import CameraSight, Moment, ViewSight, ZoomSight, gripper_px
 from baselines.views import THREE_VIEWS, VIEWS, apply_affine, cube_from_base
 
 MOVE = Augmentation(0.6, np.array([0.05, -0.03, 0.02]))
@@ -106,3 +108,19 @@ def test_the_gripper_moves_with_the_scene(episode):
     moved = MOVE.move_pose(episode[0].tcp_in_base.astype(float))
     np.testing.assert_allclose(pose[:3], apply_affine(cube_from_base(), moved[:3]), atol=1e-6)
     np.testing.assert_allclose(pose[3:], moved[3:], atol=1e-6)
+
+
+def test_the_gripper_is_seen_where_a_pixel_shows_the_same_point(episode):
+    seen = episode[0]
+    base, _ = point_maps(
+        seen.depth_mm, seen.intrinsics, seen.camera_in_base, np.eye(3, 4, dtype=np.float32)
+    )
+    row, column = np.argwhere(np.abs(base[2]).max(0) > 0)[1234]
+    held = np.r_[base[2, :, row, column], seen.tcp_in_base[3:]].astype(np.float32)
+    found = gripper_px(replace(seen, tcp_in_base=held))
+    np.testing.assert_allclose(found[2], [column + 0.5, row + 0.5], atol=1e-3)
+
+
+def test_a_gripper_behind_the_camera_is_nowhere(episode):
+    behind = episode[0].tcp_in_base + np.float32([0, 0, 5, 0, 0, 0, 0])
+    assert (gripper_px(replace(episode[0], tcp_in_base=behind)) == -np.inf).all()
