@@ -14,9 +14,9 @@ from typing import Any, Literal, Protocol
 
 from torch import Tensor, nn
 
-from baselines.augment import AugmentConfig
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.sight import Sight
+from baselines.scene.augment import AugmentConfig
+from baselines.scene.sight import Sight
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError, find_name
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 Scene = TypeVar("Scene")
-"""What the network's `baselines.sight.Sight` makes of an observation: a dataclass of tensors."""
+"""What the network's `Sight` makes of an observation: a dataclass of tensors."""
 
 
 @dataclass(frozen=True)

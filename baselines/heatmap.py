@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from baselines.compiled import compiled
-from baselines.views import VIEWS, View, project
+from baselines.scene.compiled import compiled
+from baselines.scene.views import VIEWS, View, project
 
 SIGMA_PX = 1.5
 """Width of the target heatmap in pixels, as in RVT."""

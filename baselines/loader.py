@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from baselines import augment
 from baselines.agent import Recipe
 from baselines.batch import Batch, Inputs, Labels, proprio
 from baselines.rotation import canonical_yaw, quaternion_to_bins
 from baselines.samples import KeyframeSet, Sample, stream
-from baselines.sight import Moment, Sight
+from baselines.scene import augment
+from baselines.scene.sight import Moment, Sight
+from baselines.scene.views import apply_affine, cube_from_base
 from baselines.text import SentenceTable, pad
-from baselines.views import apply_affine, cube_from_base
 from sacil_tasks.interface import Observation
 
 

@@ -13,7 +13,7 @@ from baselines.loader import Loader
 from baselines.options import Job
 from baselines.run import Validator
 from baselines.samples import KeyframeSet
-from baselines.sight import Sight
+from baselines.scene.sight import Sight
 from baselines.text import SentenceTable, cached_table
 from baselines.trainer import Trainer
 from baselines.validate import validate

@@ -11,9 +11,9 @@ from baselines import checkpoint as checkpoints
 from baselines.batch import Prediction
 from baselines.checkpoint import Checkpoint
 from baselines.loader import inputs_of
-from baselines.sight import Moment
+from baselines.scene.sight import Moment
+from baselines.scene.views import base_from_cube
 from baselines.text import Tokens, pad
-from baselines.views import base_from_cube
 from sacil_tasks.interface import Keyframe, Observation
 
 

@@ -24,7 +24,7 @@ from baselines.checkpoint import find_released
 from baselines.loader import Loader
 from baselines.rotation import multiply
 from baselines.samples import KeyframeSet, Sample, Shard
-from baselines.views import base_from_cube
+from baselines.scene.views import base_from_cube
 from sacil_tasks.aim import nearest
 from sacil_tasks.errors import run_command
 from sacil_tasks.sizes import LABELS

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
 
-from baselines import augment, cloud, heatmap, views
+from baselines import heatmap
+from baselines.scene import augment, cloud, views
 from sacil_tasks.interface import SCENE_BOUNDS
 
 POINTS = 53_000

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.batch import Batch
-from baselines.layers import linear
+from baselines.layers.attention import linear
 
 FIRST_TEMPERATURE = 0.07
 """Initial temperature, as in CLIP; the paper gives none (D-temperature)."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from baselines.layers import BlockSizes, CrossBlock
+from baselines.layers.attention import BlockSizes, CrossBlock
 
 QUERY_STD = 0.02
 """Spread of the initial queries (D-queries). They must differ: equal queries get equal gradients

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from baselines.agent import Network
 from baselines.batch import Batch, Inputs, Labels
-from baselines.cloud import point_maps
 from baselines.loader import inputs_of
 from baselines.rotation import canonical_yaw, quaternion_to_bins
-from baselines.sight import Moment, Sight
+from baselines.scene.cloud import point_maps
+from baselines.scene.sight import Moment, Sight
+from baselines.scene.views import cube_from_base
 from baselines.text import TextSpec
-from baselines.views import cube_from_base
 
 TEXT = TextSpec(name="minilm", dim=16, max_tokens=8, fingerprint="0" * 64)
 

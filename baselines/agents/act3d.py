@@ -23,17 +23,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines import ghosts
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.layers import padding_bias
+from baselines.layers import ghosts
+from baselines.layers.attention import padding_bias
+from baselines.layers.regression import grasp_error
+from baselines.layers.resnet import ResNet50
+from baselines.layers.rotary import Context, Reader, Turns, turns
+from baselines.layers.trunks import Pyramid, SmallTrunk, normalised
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.regression import grasp_error
-from baselines.resnet import ResNet50
-from baselines.rotary import Context, Reader, Turns, turns
-from baselines.sight import CameraSight, Pictures
+from baselines.scene.sight import CameraSight, Pictures
 from baselines.text import TextSpec
-from baselines.trunks import Pyramid, SmallTrunk, normalised
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS
 

@@ -23,15 +23,15 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Labels, Prediction
-from baselines.layers import attend, padding_bias
-from baselines.multiview import trimmed_text
-from baselines.pictures import heat_over, mean_point, network_images, pooled_points
+from baselines.layers.attention import attend, padding_bias
+from baselines.layers.multiview import trimmed_text
+from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
+from baselines.layers.regression import grasp_error
+from baselines.layers.stems import leaky
+from baselines.layers.unet import UnetDecoder, UnetEncoder, replicated
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.regression import grasp_error
-from baselines.sight import CameraSight, Pictures
-from baselines.stems import leaky
+from baselines.scene.sight import CameraSight, Pictures
 from baselines.text import TextSpec
-from baselines.unet import UnetDecoder, UnetEncoder, replicated
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, SCENE_BOUNDS
 

@@ -21,12 +21,12 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Labels, Prediction
-from baselines.layers import LEAK, padding_bias
-from baselines.multiview import trimmed_text
-from baselines.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
-from baselines.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
+from baselines.layers.attention import LEAK, padding_bias
+from baselines.layers.multiview import trimmed_text
+from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
+from baselines.layers.regression import grasp_error
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.regression import grasp_error
+from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
 

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.heads import ActionLogits, action_loss, choose
-from baselines.layers import NormedLinear, linear, padding_bias
-from baselines.multiview import (
+from baselines.layers.attention import NormedLinear, linear, padding_bias
+from baselines.layers.heads import ActionLogits, action_loss, choose
+from baselines.layers.multiview import (
     ActionDecoder,
     MultiViewConfig,
     ViewEncoder,
@@ -29,9 +29,9 @@ from baselines.multiview import (
     trimmed_text,
     within_views,
 )
+from baselines.layers.stems import Maps
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.sight import Views, ViewSight
-from baselines.stems import Maps
+from baselines.scene.sight import Views, ViewSight
 from baselines.text import TextSpec
 
 

@@ -27,16 +27,16 @@ from torch.nn import functional
 from baselines.agent import AgentSpec, Network
 from baselines.agents.rvt import PAPER_RECIPE, Read, RvtConfig, Transformer
 from baselines.batch import Batch, Inputs, Labels, Prediction
-from baselines.heads import ActionLogits, choose_at, loss_of_maps
 from baselines.heatmap import decode, target_heatmaps
-from baselines.layers import init_leaky, linear, mlp
-from baselines.multiview import roughened
+from baselines.layers.attention import init_leaky, linear, mlp
+from baselines.layers.heads import ActionLogits, choose_at, loss_of_maps
+from baselines.layers.multiview import roughened
+from baselines.layers.stems import IMAGE_CHANNELS, Maps, PyramidStem, leaky
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.rotation import BINS
-from baselines.sight import Views, ZoomScene, ZoomSight
-from baselines.stems import IMAGE_CHANNELS, Maps, PyramidStem, leaky
+from baselines.scene.sight import Views, ZoomScene, ZoomSight
+from baselines.scene.views import THREE_VIEWS, View, project
 from baselines.text import TextSpec
-from baselines.views import THREE_VIEWS, View, project
 
 NEIGHBOURS = 9
 """Token logits that a pixel's logit is mixed from: its own cell's and those around it."""

@@ -24,9 +24,9 @@ from torch.nn import functional
 from baselines.agent import AgentSpec, Network
 from baselines.agents.rvt import PAPER_RECIPE
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.heads import ActionLogits, action_loss, choose
-from baselines.layers import NormedLinear, linear, mlp, padding_bias
-from baselines.multiview import (
+from baselines.layers.attention import NormedLinear, linear, mlp, padding_bias
+from baselines.layers.heads import ActionLogits, action_loss, choose
+from baselines.layers.multiview import (
     ActionDecoder,
     MultiViewConfig,
     ViewEncoder,
@@ -37,11 +37,11 @@ from baselines.multiview import (
     trimmed_text,
     within_views,
 )
+from baselines.layers.stems import Maps
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.sight import Views, ViewSight
-from baselines.stems import Maps
+from baselines.scene.sight import Views, ViewSight
+from baselines.scene.views import VIEWS
 from baselines.text import TextSpec
-from baselines.views import VIEWS
 from sacil_agent.contrast import Contrast, diagnostics, same_meaning
 from sacil_agent.sadq import Read, SizeAwareQueries
 

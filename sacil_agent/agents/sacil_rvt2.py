@@ -22,10 +22,10 @@ from baselines.agent import AgentSpec
 from baselines.agents.rvt2 import PAPER as RVT2_PAPER
 from baselines.agents.rvt2 import Rvt2, Rvt2Config
 from baselines.batch import Batch
-from baselines.layers import mlp
-from baselines.multiview import last_token, positions, roughened, within_views
+from baselines.layers.attention import mlp
+from baselines.layers.multiview import last_token, positions, roughened, within_views
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.sight import Views, ZoomScene
+from baselines.scene.sight import Views, ZoomScene
 from baselines.text import TextSpec
 from sacil_agent.contrast import Contrast, diagnostics, same_meaning
 

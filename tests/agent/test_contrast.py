@@ -6,7 +6,7 @@ import pytest
 import torch
 from networks import make_batch
 
-from baselines.sight import ViewSight
+from baselines.scene.sight import ViewSight
 from sacil_agent.contrast import (
     Contrast,
     cosine_matrix,

@@ -8,7 +8,7 @@ import torch
 from networks import TEXT, changed, gradients, make_batch, make_inputs, tiny
 
 from baselines.optim import Lamb
-from baselines.sight import Views, ViewSight
+from baselines.scene.sight import Views, ViewSight
 from sacil_agent.agents.sacil import CPU, PAPER, VARIANTS, Sacil
 
 CONFIG = tiny(CPU)

@@ -8,7 +8,7 @@ from networks import TEXT, changed, gradients, make_batch, make_inputs, tiny
 
 from baselines.agents import rvt2
 from baselines.agents.rvt2 import DRAWS, Rvt2
-from baselines.sight import ZoomSight
+from baselines.scene.sight import ZoomSight
 from sacil_agent.agents.sacil_rvt2 import CPU, PAPER, SacilRvt2
 
 CONFIG = tiny(CPU)

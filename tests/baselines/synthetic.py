@@ -9,7 +9,7 @@ from torch import nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.sight import ViewSight
+from baselines.scene.sight import ViewSight
 from baselines.text import TextSpec, Tokens, text_spec
 from sacil_tasks.interface import SCENE_BOUNDS, Keyframe, Observation
 from sacil_tasks.keyframes import Episode, KeyframeDemo, KeyframeMeta, write_keyframes

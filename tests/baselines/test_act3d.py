@@ -21,8 +21,8 @@ from baselines.agents.act3d import (
     detection_loss,
 )
 from baselines.batch import Inputs
-from baselines.resnet import ResNet50
-from baselines.sight import CameraSight, Pictures
+from baselines.layers.resnet import ResNet50
+from baselines.scene.sight import CameraSight, Pictures
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from baselines.augment import AugmentConfig, draw
-from baselines.views import apply_affine, cube_from_base, render_views
+from baselines.scene.augment import AugmentConfig, draw
+from baselines.scene.views import apply_affine, cube_from_base, render_views
 from sacil_tasks.interface import SCENE_BOUNDS
 
 CENTER, HALF = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2

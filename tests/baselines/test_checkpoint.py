@@ -13,7 +13,7 @@ from baselines.batch import Inputs
 from baselines.checkpoint import CONFIG, MODEL, PROVENANCE, STATE, TEXT, Identity, TrainState
 from baselines.configs import restore
 from baselines.release import ReleaseConfig
-from baselines.sight import Views
+from baselines.scene.sight import Views
 from baselines.text import SentenceTable, TextSpec
 from sacil_tasks.catalog import suite_tasks
 from sacil_tasks.errors import UsageError

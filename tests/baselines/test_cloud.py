@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from baselines.cloud import unproject
+from baselines.scene.cloud import unproject
 
 CAMERAS, HEIGHT, WIDTH = 4, 5, 7
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from baselines.agents.act3d import CPU, METRES, PAPER, Act3dConfig
-from baselines.ghosts import Draw, in_ball, in_cube, scattered, spread
+from baselines.layers.ghosts import Draw, in_ball, in_cube, scattered, spread
 
 DRAWS = pytest.mark.parametrize("draw", [scattered, spread])
 RADIUS = 0.2

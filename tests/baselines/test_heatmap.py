@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines.heatmap import SIGMA_PX, decode, target_heatmaps
-from baselines.views import BACK, THREE_VIEWS, TOP, VIEWS, project
+from baselines.scene.views import BACK, THREE_VIEWS, TOP, VIEWS, project
 
 CHOICES = pytest.mark.parametrize(
     "views", [VIEWS, THREE_VIEWS, (TOP, BACK)], ids=["five", "three", "two"]

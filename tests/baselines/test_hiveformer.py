@@ -12,10 +12,16 @@ from torch.nn import functional
 
 from baselines.agents.hiveformer import AGENT, CPU, PAPER, HiveFormer, HiveFormerConfig
 from baselines.batch import Inputs
-from baselines.pictures import gripper_map, heat_over, mean_point, network_images, pooled_points
-from baselines.sight import Moment
+from baselines.layers.pictures import (
+    gripper_map,
+    heat_over,
+    mean_point,
+    network_images,
+    pooled_points,
+)
+from baselines.layers.unet import Merge, UnetDecoder, doubled, doubling, replicated
+from baselines.scene.sight import Moment
 from baselines.text import TextSpec
-from baselines.unet import Merge, UnetDecoder, doubled, doubling, replicated
 from sacil_tasks.errors import UsageError
 
 PUBLISHED = {

@@ -8,9 +8,9 @@ import torch
 from networks import blank_moments
 from synthetic import observation
 
-from baselines.augment import Augmentation
-from baselines.pointnet import interpolated
-from baselines.points import (
+from baselines.layers.pointnet import interpolated
+from baselines.scene.augment import Augmentation
+from baselines.scene.points import (
     HALF_SIDE_M,
     TABLE_M,
     CloudSight,
@@ -22,8 +22,8 @@ from baselines.points import (
     nearest_three,
     visible,
 )
-from baselines.sight import Moment
-from baselines.views import apply_affine
+from baselines.scene.sight import Moment
+from baselines.scene.views import apply_affine
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS
 

@@ -20,11 +20,11 @@ from baselines.agents.polarnet import (
     tool_axes,
 )
 from baselines.agents.polarnet import load as load_policy
-from baselines.augment import Augmentation
 from baselines.checkpoint import Identity
-from baselines.points import HALF_SIDE_M
 from baselines.rotation import bins_to_quaternion, multiply
-from baselines.sight import Moment
+from baselines.scene.augment import Augmentation
+from baselines.scene.points import HALF_SIDE_M
+from baselines.scene.sight import Moment
 from baselines.text import SentenceTable, TextSpec
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from baselines.regression import grasp_error, twin
+from baselines.layers.regression import grasp_error, twin
 from baselines.rotation import canonical_yaw
 from baselines.validate import grip_angle_deg
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from baselines.layers import padding_bias
-from baselines.rotary import Context, Reader, RelativeAttention, turned, turns
+from baselines.layers.attention import padding_bias
+from baselines.layers.rotary import Context, Reader, RelativeAttention, turned, turns
 
 WIDTH, HEADS, RATE = 48, 4, 30.0
 

@@ -7,8 +7,8 @@ import torch
 from networks import TEXT, make_inputs, tiny
 
 from baselines.agents.rvt import CPU, PAPER, Rvt, RvtConfig
-from baselines.multiview import last_token, roughened, trimmed_text, within_views
-from baselines.sight import Views, ViewSight
+from baselines.layers.multiview import last_token, roughened, trimmed_text, within_views
+from baselines.scene.sight import Views, ViewSight
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
 

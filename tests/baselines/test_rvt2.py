@@ -18,7 +18,7 @@ from baselines.agents.rvt2 import (
     sample,
     shown_angles,
 )
-from baselines.sight import ZoomSight
+from baselines.scene.sight import ZoomSight
 from baselines.text import TextSpec
 
 CONFIG = tiny(CPU)

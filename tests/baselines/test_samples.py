@@ -8,13 +8,13 @@ import synthetic
 import torch
 
 from baselines.agent import Recipe
-from baselines.augment import AugmentConfig
 from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet, Sample, Shard, stream
-from baselines.sight import Moment, ViewSight
+from baselines.scene.augment import AugmentConfig
+from baselines.scene.sight import Moment, ViewSight
+from baselines.scene.views import base_from_cube
 from baselines.text import SentenceTable, TextSpec, tidy
-from baselines.views import base_from_cube
 from sacil_tasks.errors import UsageError
 
 TASKS = ("pick_and_lift", "pick_up_cup")

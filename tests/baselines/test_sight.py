@@ -7,10 +7,10 @@ import pytest
 import torch
 from synthetic import observation
 
-from baselines.augment import Augmentation
-from baselines.cloud import point_maps, unproject
-from baselines.sight import CameraSight, Moment, ViewSight, ZoomSight, gripper_px
-from baselines.views import THREE_VIEWS, VIEWS, apply_affine, cube_from_base
+from baselines.scene.augment import Augmentation
+from baselines.scene.cloud import point_maps, unproject
+from baselines.scene.sight import CameraSight, Moment, ViewSight, ZoomSight, gripper_px
+from baselines.scene.views import THREE_VIEWS, VIEWS, apply_affine, cube_from_base
 
 MOVE = Augmentation(0.6, np.array([0.05, -0.03, 0.02]))
 

@@ -8,10 +8,10 @@ from baselines.batch import Prediction
 from baselines.loader import Loader
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet
-from baselines.sight import ViewSight
+from baselines.scene.sight import ViewSight
+from baselines.scene.views import cube_from_base
 from baselines.text import SentenceTable, TextSpec, tidy
 from baselines.validate import grip_angle_deg, validate
-from baselines.views import cube_from_base
 from sacil_tasks.aim import REACH_M, nearest
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.views import (
+from baselines.scene.views import (
     BACK,
     EMPTY_DEPTH,
     FRONT,

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64, UInt8
 
-from baselines.compiled import compiled
+from baselines.scene.compiled import compiled
 from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
 
 

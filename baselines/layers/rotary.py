@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.layers import attend, linear
+from baselines.layers.attention import attend, linear
 
 SPAN = 10_000
 """Ratio of the fastest to the slowest angle."""

@@ -1,9 +1,9 @@
 """Layers of a point network: set abstraction, feature propagation, and a decoder layer.
 
 As in PointNeXt-S (Qian et al., NeurIPS 2022) and PolarNet (Chen et al., CoRL 2023). A stage's
-points are a prefix of the stage's before (`baselines.points`), so nothing is searched here. Where
-a linear layer reads gathered points it is applied before they are gathered: the same numbers for
-a fraction of the products.
+points are a prefix of the stage's before (`baselines.scene.points`), so nothing is searched here.
+Where a linear layer reads gathered points it is applied before they are gathered: the same numbers
+for a fraction of the products.
 """
 
 from typing import Literal, TypeAlias
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.layers import attend
+from baselines.layers.attention import attend
 
 Norm: TypeAlias = Literal["batch", "layer"]
 """`batch`: as published; `layer`: rows of a batch stay apart (D-polarnet-norm)."""

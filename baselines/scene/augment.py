@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from baselines.rotation import multiply
-from baselines.views import apply_affine, cube_from_base
+from baselines.scene.views import apply_affine, cube_from_base
 from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
 
 

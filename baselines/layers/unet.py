@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.stems import convolution, leaky
+from baselines.layers.stems import convolution, leaky
 
 IMAGE_CHANNELS = 4
 """Red, green, blue and where the gripper is."""

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
-from baselines.augment import Augmentation
-from baselines.cloud import Cloud, crop_to_cube, point_maps, unproject
-from baselines.views import (
+from baselines.scene.augment import Augmentation
+from baselines.scene.cloud import Cloud, crop_to_cube, point_maps, unproject
+from baselines.scene.views import (
     CHANNELS,
     THREE_VIEWS,
     VIEWS,
@@ -82,7 +82,7 @@ class Views:
     """Virtual views of the merged cloud."""
 
     views: Float[Tensor, "b v 7 h w"]
-    """xyz (cube), rgb ([0, 1]), depth; see `baselines.views`."""
+    """xyz (cube), rgb ([0, 1]), depth; see `baselines.scene.views`."""
 
 
 class ViewSight:

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.layers import LEAK, init_leaky, init_plain
-from baselines.views import CHANNELS
+from baselines.layers.attention import LEAK, init_leaky, init_plain
+from baselines.scene.views import CHANNELS
 
 IMAGE_CHANNELS = len(CHANNELS) + 3
 """What is rendered, and three constant channels that say where a pixel lies."""

@@ -7,18 +7,18 @@ from torch import nn
 from torch.nn import functional
 
 from baselines.agent import Recipe
-from baselines.heads import ActionHead, ActionLogits, action_loss, choose, read_at
 from baselines.heatmap import target_heatmaps
-from baselines.layers import BlockSizes, NormedLinear, SelfBlock, attend, padding_bias
-from baselines.rotation import bins_to_quaternion
-from baselines.sight import ViewSight
-from baselines.stems import (
+from baselines.layers.attention import BlockSizes, NormedLinear, SelfBlock, attend, padding_bias
+from baselines.layers.heads import ActionHead, ActionLogits, action_loss, choose, read_at
+from baselines.layers.stems import (
     PatchDecoder,
     PatchStem,
     PyramidDecoder,
     PyramidStem,
     with_locations,
 )
+from baselines.rotation import bins_to_quaternion
+from baselines.scene.sight import ViewSight
 
 SIZES = BlockSizes(width=16, heads=2, head_width=8, hidden=24, dropout=0.0)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
-from baselines.compiled import compiled
+from baselines.scene.compiled import compiled
 
 METRES_PER_MILLIMETRE = 1e-3
 

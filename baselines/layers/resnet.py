@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.stems import Maps
+from baselines.layers.stems import Maps
 from sacil_tasks.errors import UsageError
 
 NORM_GROUPS = 32

@@ -17,9 +17,9 @@ from torch.nn import functional
 from baselines.agent import Recipe
 from baselines.batch import Labels, Prediction
 from baselines.heatmap import decode, target_heatmaps
-from baselines.layers import mlp
+from baselines.layers.attention import mlp
 from baselines.rotation import BINS, bins_to_quaternion, soft_labels
-from baselines.views import VIEWS
+from baselines.scene.views import VIEWS
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from torch import Tensor
 
-from baselines.cloud import point_maps
-from baselines.compiled import compiled
-from baselines.sight import STILL, Moment, gripper_in_cube
-from baselines.views import cube_from_base
+from baselines.scene.cloud import point_maps
+from baselines.scene.compiled import compiled
+from baselines.scene.sight import STILL, Moment, gripper_in_cube
+from baselines.scene.views import cube_from_base
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS, Observation
 

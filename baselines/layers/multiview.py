@@ -13,10 +13,9 @@ from torch import Tensor, nn
 
 from baselines.agent import Recipe
 from baselines.batch import Inputs
-from baselines.heads import ActionHead, ActionLogits
-from baselines.layers import BlockSizes, SelfBlock, linear
-from baselines.sight import Views
-from baselines.stems import (
+from baselines.layers.attention import BlockSizes, SelfBlock, linear
+from baselines.layers.heads import ActionHead, ActionLogits
+from baselines.layers.stems import (
     Maps,
     PatchDecoder,
     PatchStem,
@@ -24,7 +23,8 @@ from baselines.stems import (
     PyramidStem,
     with_locations,
 )
-from baselines.views import VIEWS, View
+from baselines.scene.sight import Views
+from baselines.scene.views import VIEWS, View
 from sacil_tasks.errors import UsageError
 
 

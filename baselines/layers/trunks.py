@@ -2,7 +2,7 @@
 
     images (n, 3, h, w) -> trunk -> maps, fine to coarse -> Pyramid -> a coarse and a fine map
 
-`SmallTrunk` is made for one core; `baselines.resnet` holds the published one.
+`SmallTrunk` is made for one core; `baselines.layers.resnet` holds the published one.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.stems import Maps
+from baselines.layers.stems import Maps
 
 MEAN, SPREAD = (0.4815, 0.4578, 0.4082), (0.2686, 0.2613, 0.2758)
 """Of red, green and blue in [0, 1], as CLIP's trunk expects them."""

@@ -1,0 +1,1 @@
+"""Parts of networks: attention, image and point encoders, heads."""
