@@ -163,7 +163,14 @@ class Rvt(Transformer, Network):
         return choose(self(inputs))
 
 
-AGENT = AgentSpec(name="rvt", presets={"cpu": CPU, "paper": PAPER}, create=Rvt)
+AGENT = AgentSpec(
+    name="rvt",
+    presets={"cpu": CPU, "paper": PAPER},
+    # The same network under another name: tables let this row have more samples than the others,
+    # as many as `sacil`'s core-minutes buy.
+    variants={"equal_compute": lambda config: config},
+    create=Rvt,
+)
 
 
 def load(*, checkpoint: Path | None, tasks: tuple[str, ...], variant: str | None) -> KeyframePolicy:
