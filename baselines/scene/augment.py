@@ -1,6 +1,7 @@
 """Random rigid moves of a whole scene: the cloud and the label together (RVT section 3.3).
 
-The scene turns about the vertical through the label and is then shifted. After a turn a gripper
+The scene turns about the vertical through the label and is then shifted, but not up or down
+(D-heights). After a turn a gripper
 label may leave the canonical half of its symmetry: pass it through `rotation.canonical_yaw`.
 """
 
@@ -22,7 +23,11 @@ class AugmentConfig:
     """Largest turn about the vertical, to either side."""
 
     translation_m: float = 0.125
-    """Largest shift along each axis, to either side."""
+    """Largest shift along x and along y, to either side."""
+
+    rise_m: float = 0.0
+    """Largest shift up or down. The table is equally high in all scenes, so that the height of an
+    object's top tells its size, unless shifts hide it (D-heights; the paper's 0.125)."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ def draw(
     that keeps the target inside (D-shift: RVT clamps, which piles labels up on the faces).
     """
     target = np.asarray(target_in_base, np.float64)
-    center, reach = np.asarray(bounds.center_in_base), config.translation_m
+    center = np.asarray(bounds.center_in_base)
+    reach = np.array([config.translation_m, config.translation_m, config.rise_m])
     to_low = center - bounds.side_m / 2 - target
     to_high = center + bounds.side_m / 2 - target
     yaw_rad = rng.uniform(-config.yaw_rad, config.yaw_rad)

@@ -10,6 +10,7 @@ from sacil_tasks.interface import SCENE_BOUNDS
 
 CENTER, HALF = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2
 MIDDLE = CENTER + np.array([0.03, -0.05, 0.02])
+RISING = AugmentConfig(rise_m=0.125)
 
 
 def moves(target, count=300, config=AugmentConfig()):  # noqa: B008
@@ -40,15 +41,21 @@ def test_the_turn_pivots_on_the_label_and_stays_in_its_range():
     turns = np.array([move.yaw_rad for move in moves(MIDDLE)])
     assert np.abs(shifts).max() <= 0.125
     assert np.abs(turns).max() <= np.pi / 4
-    assert (shifts.min(0) < -0.12).all()
-    assert (shifts.max(0) > 0.12).all()
+    assert (shifts.min(0)[:2] < -0.12).all()
+    assert (shifts.max(0)[:2] > 0.12).all()
     assert turns.min() < -0.75
     assert turns.max() > 0.75
 
 
-def test_heights_change_by_the_shift_alone():
+def test_heights_stay_unless_a_rise_is_asked_for():
     points = np.random.default_rng(0).uniform(-1, 1, (30, 3))
     for move in moves(MIDDLE, 10):
+        np.testing.assert_allclose(move.move_points(points)[:, 2], points[:, 2], atol=1e-12)
+
+
+def test_heights_change_by_the_shift_alone():
+    points = np.random.default_rng(0).uniform(-1, 1, (30, 3))
+    for move in moves(MIDDLE, 10, RISING):
         rise = move.move_points(points)[:, 2] - points[:, 2]
         np.testing.assert_allclose(rise, rise[0], atol=1e-12)
 
@@ -56,13 +63,13 @@ def test_heights_change_by_the_shift_alone():
 @pytest.mark.parametrize("corner", [(-1, -1, -1), (1, 1, 1), (-0.9, 0.2, 0.99), (0, 0, -0.8)])
 def test_the_label_never_leaves_the_cube(corner):
     target = CENTER + HALF * np.array(corner)
-    for move in moves(target):
+    for move in moves(target, config=RISING):
         assert np.abs(apply_affine(move.to_cube(), target)).max() <= 1 + 1e-6
 
 
 def test_labels_near_a_face_are_not_piled_up_on_it():
     target = CENTER - np.array([0, 0, HALF - 0.02])
-    heights = np.array([move.move_points(target)[2] for move in moves(target)])
+    heights = np.array([move.move_points(target)[2] for move in moves(target, config=RISING)])
     on_the_face = np.isclose(heights, CENTER[2] - HALF, atol=1e-4)
     assert on_the_face.mean() < 0.02
 
