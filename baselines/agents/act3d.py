@@ -27,7 +27,7 @@ from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.layers import ghosts
 from baselines.layers.attention import padding_bias
-from baselines.layers.regression import grasp_error
+from baselines.layers.regression import GRIP, grip_error, grip_quaternion
 from baselines.layers.resnet import ResNet50
 from baselines.layers.rotary import Context, Reader, Turns, turns
 from baselines.layers.trunks import Pyramid, SmallTrunk, normalised
@@ -91,9 +91,7 @@ class Act3dConfig:
     label_spread_m: float = 0.01
     """Distance from the label at which a ghost's target falls by a factor e."""
 
-    recipe: Recipe = field(
-        default_factory=lambda: Recipe(lr=3e-3, rotation_weight=10.0, precision="bf16")
-    )
+    recipe: Recipe = field(default_factory=lambda: Recipe(lr=3e-3, precision="bf16"))
     """How to train (D-act3d-recipe)."""
 
     def __post_init__(self) -> None:
@@ -180,9 +178,11 @@ class Detection:
 
     levels: list[Level]
 
-    action: Float[Tensor, "b 6"]
-    """Quaternion wxyz of any length, logits of gripper open and ignore collisions
-    (D-act3d-collision)."""
+    grip: Float[Tensor, "b 9"]
+    """Orientation, see `baselines.layers.regression`."""
+
+    flags: Float[Tensor, "b 2"]
+    """Logits of gripper open and ignore collisions (D-act3d-collision)."""
 
 
 Place = Callable[[int, Float[Tensor, "b 3"]], Float[Tensor, "b g 3"]]
@@ -210,7 +210,7 @@ class Act3d(Network):
         self.query = nn.Parameter(torch.randn(width))
         readers = [Reader(width, config.heads, blocks) for blocks in config.blocks]
         self.read_words, self.read_as_ghost, self.read_as_query = readers
-        self.action = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6))
+        self.action = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, GRIP + 2))
 
     def load_pretrained(self) -> None:
         """CLIP's weights, if the config asks for them.
@@ -239,7 +239,8 @@ class Act3d(Network):
                 query = self.read_as_query(query, self._code(guess[:, None]), context)
             levels.append(self._score(place(index, guess), query, context))
             guess = levels[-1].guess
-        return Detection(levels, self.action(query[:, 0]).float())
+        action = self.action(query[:, 0]).float()
+        return Detection(levels, grip=action[:, :GRIP], flags=action[:, GRIP:])
 
     def _cells(self, scene: Pictures) -> tuple[Cells, Cells]:
         """The present images as coarse and fine cells of all cameras.
@@ -294,16 +295,14 @@ class Act3d(Network):
             return self._place(draw, level, labels.position_in_cube, count)
 
         found = self(batch.inputs, around_label)
-        action, spread = found.action, config.label_spread_m / METRES
-        turn = functional.normalize(action[:, :4], dim=-1)
+        spread = config.label_spread_m / METRES
         flags = torch.stack([labels.gripper_open, labels.ignore_collisions], dim=1).float()
         binary = functional.binary_cross_entropy_with_logits
         terms = {
             "bc/position": detection_loss(found.levels, labels.position_in_cube, spread),
-            # D-act3d-rotation: a mean square error, but q, -q and the twins are one grasp.
-            "bc/rotation": grasp_error(turn, labels.quaternion_wxyz).mean() / 4,
-            "bc/gripper": binary(action[:, 4], flags[:, 0]),
-            "bc/collision": binary(action[:, 5], flags[:, 1]),
+            "bc/rotation": grip_error(found.grip, labels.quaternion_wxyz).mean(),
+            "bc/gripper": binary(found.flags[:, 0], flags[:, 0]),
+            "bc/collision": binary(found.flags[:, 1], flags[:, 1]),
         }
         weights = {"bc/rotation": config.recipe.rotation_weight}
         total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
@@ -318,9 +317,9 @@ class Act3d(Network):
         found = self(inputs, around_guess)
         return Prediction(
             position_in_cube=found.levels[-1].guess,
-            quaternion_wxyz=functional.normalize(found.action[:, :4], dim=-1),
-            gripper_open=found.action[:, 4] > 0,
-            ignore_collisions=found.action[:, 5] > 0,
+            quaternion_wxyz=grip_quaternion(found.grip),
+            gripper_open=found.flags[:, 0] > 0,
+            ignore_collisions=found.flags[:, 1] > 0,
         )
 
     def _place(

@@ -26,7 +26,7 @@ from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import attend, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
-from baselines.layers.regression import grasp_error
+from baselines.layers.regression import GRIP, grip_error, grip_quaternion
 from baselines.layers.stems import leaky
 from baselines.layers.unet import UnetDecoder, UnetEncoder, replicated
 from baselines.policy import KeyframePolicy, load_policy
@@ -42,7 +42,7 @@ MAX_WORDS = 77
 """Places in a sentence that have an embedding (the published code's 42 are too few for its own
 text encoder)."""
 
-OUTPUTS = {"offset": 3, "quaternion": 4, "gripper": 1, "collision": 1}
+OUTPUTS = {"offset": 3, "grip": GRIP, "gripper": 1, "collision": 1}
 """What is regressed beside the heatmap (D-hiveformer-offset)."""
 
 
@@ -144,7 +144,7 @@ class Choice:
     """Probability of each pixel; sums to 1 over all cameras."""
 
     position_in_cube: Float[Tensor, "b 3"]
-    quaternion_wxyz: Float[Tensor, "b 4"]
+    grip: Float[Tensor, "b 9"]
     gripper: Float[Tensor, "b"]
     collision: Float[Tensor, "b"]
 
@@ -218,14 +218,14 @@ class HiveFormer(Network):
         return tokens
 
     def _choose(
-        self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 9"]
+        self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 14"]
     ) -> Choice:
         heat = heat_over(logits.unflatten(0, (-1, len(CAMERAS))), scene.seen[:, -1], TEMPERATURE)
-        offset, quaternion, gripper, collision = pose.split(tuple(OUTPUTS.values()), dim=-1)
+        offset, grip, gripper, collision = pose.split(tuple(OUTPUTS.values()), dim=-1)
         return Choice(
             heat=heat,
             position_in_cube=mean_point(heat, scene.xyz_in_cube[:, -1]) + offset,
-            quaternion_wxyz=functional.normalize(quaternion, dim=-1),
+            grip=grip,
             gripper=gripper[:, 0],
             collision=collision[:, 0],
         )
@@ -239,7 +239,7 @@ class HiveFormer(Network):
         choice = self(inputs)
         return Prediction(
             position_in_cube=choice.position_in_cube,
-            quaternion_wxyz=choice.quaternion_wxyz,
+            quaternion_wxyz=grip_quaternion(choice.grip),
             gripper_open=choice.gripper > 0,
             ignore_collisions=choice.collision > 0,
         )
@@ -368,7 +368,7 @@ class PoseHead(nn.Module):
         self.hidden = nn.Linear(width, width)
         self.out = nn.Linear(width, sum(OUTPUTS.values()))
 
-    def forward(self, grids: Float[Tensor, "m c y x"]) -> Float[Tensor, "b 9"]:
+    def forward(self, grids: Float[Tensor, "m c y x"]) -> Float[Tensor, "b 14"]:
         """Numbers in the order of `OUTPUTS`."""
         cameras = rearrange(grids, "(b k) c y x -> b (k c) y x", k=len(CAMERAS))
         x = self.second(leaky(self.norm(self.first(cameras))))
@@ -378,13 +378,13 @@ class PoseHead(nn.Module):
 def cloning_loss(
     choice: Choice, labels: Labels, config: HiveFormerConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Squared errors of position (m) and quaternion, cross-entropy of the two flags."""
+    """Squared errors of position (m) and grip, cross-entropy of the two flags."""
     error_m = (choice.position_in_cube - labels.position_in_cube) * (SCENE_BOUNDS.side_m / 2)
     # D-hiveformer-flags: published as the squared error of a sigmoid.
     flag_loss = functional.binary_cross_entropy_with_logits
     terms = {
         "bc/position": error_m.square().sum(-1).mean(),
-        "bc/rotation": grasp_error(choice.quaternion_wxyz, labels.quaternion_wxyz).mean(),
+        "bc/rotation": grip_error(choice.grip, labels.quaternion_wxyz).mean(),
         "bc/gripper": flag_loss(choice.gripper, labels.gripper_open.float()),
         "bc/collision": flag_loss(choice.collision, labels.ignore_collisions.float()),
     }

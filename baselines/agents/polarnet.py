@@ -24,7 +24,7 @@ from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
-from baselines.layers.regression import grasp_error
+from baselines.layers.regression import GRIP, grip_error, grip_quaternion
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
 from baselines.text import TextSpec
@@ -88,9 +88,9 @@ class PolarNetConfig:
 
     position_weight: float = 100.0
     """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
-    the quaternion's (D-polarnet-weights)."""
+    the grip's (D-polarnet-weights)."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", rotation_weight=100.0))
+    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16"))
     """How to train."""
 
     def __post_init__(self) -> None:
@@ -161,7 +161,7 @@ class Guess:
     """Logits over the points."""
 
     position_in_cube: Float[Tensor, "b 3"]
-    quaternion_wxyz: Float[Tensor, "b 4"]
+    grip: Float[Tensor, "b 9"]
     gripper: Float[Tensor, "b"]
     collision: Float[Tensor, "b"]
 
@@ -190,7 +190,7 @@ class PolarNet(Network):
         self.pose = nn.Sequential(  # D-polarnet-heads
             nn.Linear(coarse[-1], width * 3 // 2),
             nn.LeakyReLU(LEAK),
-            nn.Linear(width * 3 // 2, 6),
+            nn.Linear(width * 3 // 2, GRIP + 2),
         )
 
     def forward(self, inputs: Inputs[PointCloud]) -> Guess:
@@ -220,20 +220,19 @@ class PolarNet(Network):
         return Guess(
             heat=heat,
             position_in_cube=inputs.gripper_in_cube[:, :3] + inputs.scene.reach[:, None] * voted,
-            quaternion_wxyz=functional.normalize(pose[:, :4], dim=-1),
-            gripper=pose[:, 4],
-            collision=pose[:, 5],
+            grip=pose[:, :GRIP],
+            gripper=pose[:, GRIP],
+            collision=pose[:, GRIP + 1],
         )
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning; terms without their weights."""
         guess, labels = self(batch.inputs), batch.labels
         error_m = (guess.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
-        shared = grasp_error(guess.quaternion_wxyz, labels.quaternion_wxyz)
         terms = {
             "bc/heat": _divergence(guess.heat, heat_labels(batch.inputs, labels)),
             "bc/position": error_m.square().mean(),
-            "bc/rotation": shared.mean() / 4,
+            "bc/rotation": grip_error(guess.grip, labels.quaternion_wxyz).mean(),
             "bc/gripper": _binary(guess.gripper, labels.gripper_open),
             "bc/collision": _binary(guess.collision, labels.ignore_collisions),
         }
@@ -250,7 +249,7 @@ class PolarNet(Network):
         guess = self(inputs)
         return Prediction(
             position_in_cube=guess.position_in_cube,
-            quaternion_wxyz=guess.quaternion_wxyz,
+            quaternion_wxyz=grip_quaternion(guess.grip),
             gripper_open=guess.gripper > 0,
             ignore_collisions=guess.collision > 0,
         )

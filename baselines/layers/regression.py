@@ -1,21 +1,61 @@
-"""The loss of agents that regress an orientation as a quaternion."""
+"""A grip as numbers that can be regressed, for agents that do not classify rotations (D-grip).
 
+Two parallel fingers grip alike from an orientation and from its twin, half a turn about the tool z
+axis. As quaternions a grip therefore has four names, and no continuous function of the scene picks
+one of them. Its approach (tool z) and its closing line (the outer product of tool x with itself)
+have one value each and change smoothly.
+"""
+
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from baselines.rotation import canonical_yaw
 
-def twin(quaternion_wxyz: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
-    """The orientation after half a turn about the tool z axis: the same grasp for two fingers."""
+GRIP = 9
+"""Numbers of a grip: the tool z axis, then xx, yy, zz, and sqrt(2) times xy, yz, xz of the outer
+product, so that their distance is that of the matrices."""
+
+_ROWS, _COLUMNS = (0, 1, 2, 0, 1, 0), (0, 1, 2, 1, 2, 2)
+_SCALES = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
+
+
+def grip_numbers(quaternion_wxyz: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 9"]:
+    """The grip of unit quaternions; equal for q, -q and their twins."""
     w, x, y, z = quaternion_wxyz.unbind(-1)
-    return torch.stack([-z, y, -x, w], dim=-1)
+    tool_x = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    tool_z = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    outer = (
+        scale * tool_x[row] * tool_x[column]
+        for row, column, scale in zip(_ROWS, _COLUMNS, _SCALES, strict=True)
+    )
+    return torch.stack([*tool_z, *outer], dim=-1)
 
 
-def grasp_error(
-    quaternion_wxyz: Float[Tensor, "*b 4"], label_wxyz: Float[Tensor, "*b 4"]
+def grip_error(
+    numbers: Float[Tensor, "*b 9"], quaternion_wxyz: Float[Tensor, "*b 4"]
 ) -> Float[Tensor, "*b"]:
-    """Squared distance of unit quaternions to the nearest of the label, its twin and their
-    negatives, all of which are the same grasp (D-twins)."""
-    labels = torch.stack([label_wxyz, twin(label_wxyz)], dim=-2)
-    cosines = (quaternion_wxyz[..., None, :] * labels).sum(-1).abs()
-    return 2 * (1 - cosines.amax(-1))
+    """Squared distance of regressed numbers to the grip of a label."""
+    return (numbers - grip_numbers(quaternion_wxyz)).square().sum(-1)
+
+
+def grip_quaternion(numbers: Float[Tensor, "b 9"]) -> Float[Tensor, "b 4"]:
+    """The orientation nearest to regressed numbers: wxyz, the canonical one of the twins.
+
+    The approach is taken as it points; the closing line is the main axis of the outer product in
+    the plane across the approach.
+    """
+    n = numbers.detach().double().cpu().numpy()
+    tool_z = n[:, :3] / np.linalg.norm(n[:, :3], axis=1, keepdims=True)
+    outer = np.empty((len(n), 3, 3))
+    outer[:, _ROWS, _COLUMNS] = outer[:, _COLUMNS, _ROWS] = n[:, 3:] / _SCALES
+    along = tool_z[:, :, None] * tool_z[:, None]
+    across = np.eye(3) - along
+    # In its own direction the approach must lose against any axis across it.
+    flat = across @ outer @ across - (1 + np.abs(outer).sum((1, 2)))[:, None, None] * along
+    tool_x = np.linalg.eigh(flat).eigenvectors[:, :, -1]
+    axes = np.stack([tool_x, np.cross(tool_z, tool_x), tool_z], axis=-1)
+    turn = canonical_yaw(Rotation.from_matrix(axes).as_quat(scalar_first=True))
+    return torch.from_numpy(turn).to(numbers)

@@ -72,7 +72,7 @@ def test_moving_everything_changes_no_score(network: Act3d) -> None:
         torch.testing.assert_close(after.ghosts_in_cube, before.ghosts_in_cube + shift)
         assert (after.scores - before.scores).abs().max() < 1e-5
         assert before.scores.std(dim=-1).min() > 1e-2, "a ghost's place matters"
-    torch.testing.assert_close(there.action, here.action, rtol=0, atol=1e-5)
+    torch.testing.assert_close(there.grip, here.grip, rtol=0, atol=1e-5)
 
 
 def test_moving_the_hand_alone_changes_scores(network: Act3d) -> None:
@@ -88,7 +88,7 @@ def test_words_change_scores_and_action(network: Act3d) -> None:
     before = detect(network, inputs, zero)
     after = detect(network, replace(inputs, text=-inputs.text), zero)
     assert (before.levels[0].scores - after.levels[0].scores).abs().max() > 1e-3
-    assert (before.action - after.action).abs().max() > 1e-3
+    assert (before.grip - after.grip).abs().max() > 1e-3
 
 
 def test_answers_are_the_same_every_time(network: Act3d) -> None:
@@ -138,8 +138,8 @@ def test_the_paper_preset_has_the_published_number_of_parameters(
         p.numel() for name, p in network.named_parameters() if not name.startswith("trunk")
     )
     unread_outputs = 3 * (9 * embedding**2 + embedding)  # D-act3d-outputs
-    collision_logit = embedding + 1
-    assert beside_trunk == published - unread_outputs + collision_logit
+    added_outputs = 6 * (embedding + 1)  # D-act3d-collision, D-grip
+    assert beside_trunk == published - unread_outputs + added_outputs
 
 
 def test_a_frozen_trunk_holds_clips_weights_and_keeps_them(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ OURS = {
     "77 words": (77 - 42) * 64,
     "25 steps": (25 - 10) * 64,
     "offset and collision (D-hiveformer-offset)": 4 * 64 + 4,
+    "grip (D-grip)": 5 * 64 + 5,
 }
 """What our inputs and outputs add."""
 
