@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from baselines.batch import Batch, Inputs, Prediction
@@ -83,6 +84,14 @@ class Recipe:
             raise UsageError(
                 f"recipe.samples ({self.samples}) is less than a batch ({self.batch})."
             )
+
+
+def weighed(
+    terms: Mapping[str, Tensor], weights: Mapping[str, float]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Sum of a loss's terms, each times its weight (1 where none is given), and the bare terms."""
+    total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
+    return total, {name: term.detach() for name, term in terms.items()}
 
 
 class AgentConfig(Protocol):

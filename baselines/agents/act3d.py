@@ -23,11 +23,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.agent import AgentSpec, Network, Recipe
+from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.layers import ghosts
 from baselines.layers.attention import padding_bias
-from baselines.layers.regression import GRIP, grip_error, grip_quaternion
+from baselines.layers.regression import POSE, Regressed
 from baselines.layers.resnet import ResNet50
 from baselines.layers.rotary import Context, Reader, Turns, turns
 from baselines.layers.trunks import Pyramid, SmallTrunk, normalised
@@ -178,11 +178,8 @@ class Detection:
 
     levels: list[Level]
 
-    grip: Float[Tensor, "b 9"]
-    """Orientation, see `baselines.layers.regression`."""
-
-    flags: Float[Tensor, "b 2"]
-    """Logits of gripper open and ignore collisions (D-act3d-collision)."""
+    action: Regressed
+    """At the last guess (D-act3d-collision)."""
 
 
 Place = Callable[[int, Float[Tensor, "b 3"]], Float[Tensor, "b g 3"]]
@@ -210,7 +207,7 @@ class Act3d(Network):
         self.query = nn.Parameter(torch.randn(width))
         readers = [Reader(width, config.heads, blocks) for blocks in config.blocks]
         self.read_words, self.read_as_ghost, self.read_as_query = readers
-        self.action = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, GRIP + 2))
+        self.action = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, POSE))
 
     def load_pretrained(self) -> None:
         """CLIP's weights, if the config asks for them.
@@ -239,8 +236,7 @@ class Act3d(Network):
                 query = self.read_as_query(query, self._code(guess[:, None]), context)
             levels.append(self._score(place(index, guess), query, context))
             guess = levels[-1].guess
-        action = self.action(query[:, 0]).float()
-        return Detection(levels, grip=action[:, :GRIP], flags=action[:, GRIP:])
+        return Detection(levels, Regressed(guess, self.action(query[:, 0]).float()))
 
     def _cells(self, scene: Pictures) -> tuple[Cells, Cells]:
         """The present images as coarse and fine cells of all cameras.
@@ -296,17 +292,11 @@ class Act3d(Network):
 
         found = self(batch.inputs, around_label)
         spread = config.label_spread_m / METRES
-        flags = torch.stack([labels.gripper_open, labels.ignore_collisions], dim=1).float()
-        binary = functional.binary_cross_entropy_with_logits
         terms = {
             "bc/position": detection_loss(found.levels, labels.position_in_cube, spread),
-            "bc/rotation": grip_error(found.grip, labels.quaternion_wxyz).mean(),
-            "bc/gripper": binary(found.flags[:, 0], flags[:, 0]),
-            "bc/collision": binary(found.flags[:, 1], flags[:, 1]),
+            **found.action.terms(labels),
         }
-        weights = {"bc/rotation": config.recipe.rotation_weight}
-        total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
-        return total, {name: term.detach() for name, term in terms.items()}
+        return weighed(terms, {"bc/rotation": config.recipe.rotation_weight})
 
     def act(self, inputs: Inputs) -> Prediction:
         """The best ghost of the last level; ghosts are evenly spread, the same every time."""
@@ -314,13 +304,7 @@ class Act3d(Network):
         def around_guess(level: int, guess: Tensor) -> Tensor:
             return self._place(ghosts.spread, level, guess, self.config.ghosts_acting[level])
 
-        found = self(inputs, around_guess)
-        return Prediction(
-            position_in_cube=found.levels[-1].guess,
-            quaternion_wxyz=grip_quaternion(found.grip),
-            gripper_open=found.flags[:, 0] > 0,
-            ignore_collisions=found.flags[:, 1] > 0,
-        )
+        return self(inputs, around_guess).action.prediction
 
     def _place(
         self, draw: ghosts.Draw, level: int, center: Float[Tensor, "b 3"], count: int

@@ -21,12 +21,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.agent import AgentSpec, Network, Recipe
+from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import attend, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
-from baselines.layers.regression import GRIP, grip_error, grip_quaternion
+from baselines.layers.regression import POSE, Regressed
 from baselines.layers.stems import leaky
 from baselines.layers.unet import UnetDecoder, UnetEncoder, replicated
 from baselines.policy import KeyframePolicy, load_policy
@@ -42,8 +42,8 @@ MAX_WORDS = 77
 """Places in a sentence that have an embedding (the published code's 42 are too few for its own
 text encoder)."""
 
-OUTPUTS = {"offset": 3, "grip": GRIP, "gripper": 1, "collision": 1}
-"""What is regressed beside the heatmap (D-hiveformer-offset)."""
+OFFSET = 3
+"""Numbers that are added to the position, beside those of the pose (D-hiveformer-offset)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,10 +143,7 @@ class Choice:
     heat: Float[Tensor, "b k h w"]
     """Probability of each pixel; sums to 1 over all cameras."""
 
-    position_in_cube: Float[Tensor, "b 3"]
-    grip: Float[Tensor, "b 9"]
-    gripper: Float[Tensor, "b"]
-    collision: Float[Tensor, "b"]
+    action: Regressed
 
 
 class HiveFormer(Network):
@@ -221,14 +218,8 @@ class HiveFormer(Network):
         self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 14"]
     ) -> Choice:
         heat = heat_over(logits.unflatten(0, (-1, len(CAMERAS))), scene.seen[:, -1], TEMPERATURE)
-        offset, grip, gripper, collision = pose.split(tuple(OUTPUTS.values()), dim=-1)
-        return Choice(
-            heat=heat,
-            position_in_cube=mean_point(heat, scene.xyz_in_cube[:, -1]) + offset,
-            grip=grip,
-            gripper=gripper[:, 0],
-            collision=collision[:, 0],
-        )
+        position = mean_point(heat, scene.xyz_in_cube[:, -1]) + pose[:, :OFFSET]
+        return Choice(heat, Regressed(position, pose[:, OFFSET:]))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning."""
@@ -236,13 +227,7 @@ class HiveFormer(Network):
 
     def act(self, inputs: Inputs) -> Prediction:
         """The keyframe that was regressed."""
-        choice = self(inputs)
-        return Prediction(
-            position_in_cube=choice.position_in_cube,
-            quaternion_wxyz=grip_quaternion(choice.grip),
-            gripper_open=choice.gripper > 0,
-            ignore_collisions=choice.collision > 0,
-        )
+        return self(inputs).action.prediction
 
 
 class NormedTable(nn.Module):
@@ -366,10 +351,10 @@ class PoseHead(nn.Module):
         self.norm = nn.GroupNorm(1, width)
         self.second = replicated(width, width, stride=2)
         self.hidden = nn.Linear(width, width)
-        self.out = nn.Linear(width, sum(OUTPUTS.values()))
+        self.out = nn.Linear(width, OFFSET + POSE)
 
     def forward(self, grids: Float[Tensor, "m c y x"]) -> Float[Tensor, "b 14"]:
-        """Numbers in the order of `OUTPUTS`."""
+        """Offset, then the numbers of the pose."""
         cameras = rearrange(grids, "(b k) c y x -> b (k c) y x", k=len(CAMERAS))
         x = self.second(leaky(self.norm(self.first(cameras))))
         return self.out(leaky(self.hidden(x.mean((-2, -1))))).float()
@@ -379,21 +364,14 @@ def cloning_loss(
     choice: Choice, labels: Labels, config: HiveFormerConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Squared errors of position (m) and grip, cross-entropy of the two flags."""
-    error_m = (choice.position_in_cube - labels.position_in_cube) * (SCENE_BOUNDS.side_m / 2)
+    error_m = (choice.action.position_in_cube - labels.position_in_cube) * (SCENE_BOUNDS.side_m / 2)
     # D-hiveformer-flags: published as the squared error of a sigmoid.
-    flag_loss = functional.binary_cross_entropy_with_logits
-    terms = {
-        "bc/position": error_m.square().sum(-1).mean(),
-        "bc/rotation": grip_error(choice.grip, labels.quaternion_wxyz).mean(),
-        "bc/gripper": flag_loss(choice.gripper, labels.gripper_open.float()),
-        "bc/collision": flag_loss(choice.collision, labels.ignore_collisions.float()),
-    }
+    terms = {"bc/position": error_m.square().sum(-1).mean(), **choice.action.terms(labels)}
     weights = {
         "bc/position": config.position_weight,
         "bc/rotation": config.recipe.rotation_weight,
     }
-    total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
-    return total, {name: term.detach() for name, term in terms.items()}
+    return weighed(terms, weights)
 
 
 AGENT = AgentSpec(

@@ -19,12 +19,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.agent import AgentSpec, Network, Recipe
+from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
-from baselines.layers.regression import GRIP, grip_error, grip_quaternion
+from baselines.layers.regression import POSE, Regressed
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
 from baselines.text import TextSpec
@@ -160,10 +160,7 @@ class Guess:
     heat: Float[Tensor, "b n"]
     """Logits over the points."""
 
-    position_in_cube: Float[Tensor, "b 3"]
-    grip: Float[Tensor, "b 9"]
-    gripper: Float[Tensor, "b"]
-    collision: Float[Tensor, "b"]
+    action: Regressed
 
 
 class PolarNet(Network):
@@ -190,7 +187,7 @@ class PolarNet(Network):
         self.pose = nn.Sequential(  # D-polarnet-heads
             nn.Linear(coarse[-1], width * 3 // 2),
             nn.LeakyReLU(LEAK),
-            nn.Linear(width * 3 // 2, GRIP + 2),
+            nn.Linear(width * 3 // 2, POSE),
         )
 
     def forward(self, inputs: Inputs[PointCloud]) -> Guess:
@@ -217,42 +214,28 @@ class PolarNet(Network):
     def _guess(self, points: Tensor, pose: Tensor, inputs: Inputs[PointCloud]) -> Guess:
         heat = points[..., 0] / TEMPERATURE
         voted = read_out(heat, inputs.scene.xyz + points[..., 1:])
-        return Guess(
-            heat=heat,
-            position_in_cube=inputs.gripper_in_cube[:, :3] + inputs.scene.reach[:, None] * voted,
-            grip=pose[:, :GRIP],
-            gripper=pose[:, GRIP],
-            collision=pose[:, GRIP + 1],
-        )
+        position = inputs.gripper_in_cube[:, :3] + inputs.scene.reach[:, None] * voted
+        return Guess(heat, Regressed(position, pose))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning; terms without their weights."""
         guess, labels = self(batch.inputs), batch.labels
-        error_m = (guess.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
+        error_m = (guess.action.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
         terms = {
             "bc/heat": _divergence(guess.heat, heat_labels(batch.inputs, labels)),
             "bc/position": error_m.square().mean(),
-            "bc/rotation": grip_error(guess.grip, labels.quaternion_wxyz).mean(),
-            "bc/gripper": _binary(guess.gripper, labels.gripper_open),
-            "bc/collision": _binary(guess.collision, labels.ignore_collisions),
+            **guess.action.terms(labels),
         }
         weights = {
             "bc/heat": self.config.heat_weight,
             "bc/position": self.config.position_weight,
             "bc/rotation": self.config.recipe.rotation_weight,
         }
-        total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
-        return total, {name: term.detach() for name, term in terms.items()}
+        return weighed(terms, weights)
 
     def act(self, inputs: Inputs[PointCloud]) -> Prediction:
         """The mean place, the rotation, and the likelier states."""
-        guess = self(inputs)
-        return Prediction(
-            position_in_cube=guess.position_in_cube,
-            quaternion_wxyz=grip_quaternion(guess.grip),
-            gripper_open=guess.gripper > 0,
-            ignore_collisions=guess.collision > 0,
-        )
+        return self(inputs).action.prediction
 
 
 class Bottleneck(nn.Module):
@@ -324,10 +307,6 @@ def tool_axes(quaternion_wxyz: Float[Tensor, "b 4"]) -> Float[Tensor, "b 6"]:
 def _divergence(logits: Float[Tensor, "b n"], label: Float[Tensor, "b n"]) -> Tensor:
     """Kullback-Leibler divergence: 0 where the heat is the label, mean over samples."""
     return functional.kl_div(logits.log_softmax(-1), label, reduction="batchmean")
-
-
-def _binary(logit: Tensor, label: Tensor) -> Tensor:
-    return functional.binary_cross_entropy_with_logits(logit, label.float())
 
 
 AGENT = AgentSpec(name="polarnet", presets={"cpu": CPU, "paper": PAPER}, create=PolarNet)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.agent import Recipe
+from baselines.agent import Recipe, weighed
 from baselines.batch import Labels, Prediction
 from baselines.heatmap import decode, target_heatmaps
 from baselines.layers.attention import mlp
@@ -96,9 +96,7 @@ def loss_of_maps(
         "bc/gripper": functional.cross_entropy(logits.gripper, labels.gripper_open),
         "bc/collision": functional.cross_entropy(logits.collision, labels.ignore_collisions),
     }
-    weights = {"bc/rotation": recipe.rotation_weight}
-    total = torch.stack([weights.get(name, 1.0) * term for name, term in terms.items()]).sum()
-    return total, {name: term.detach() for name, term in terms.items()}
+    return weighed(terms, {"bc/rotation": recipe.rotation_weight})
 
 
 def _heatmap_loss(logits: Float[Tensor, "b v h w"], target: Float[Tensor, "b v h w"]) -> Tensor:

@@ -6,20 +6,54 @@ one of them. Its approach (tool z) and its closing line (the outer product of to
 have one value each and change smoothly.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn import functional
 
+from baselines.batch import Labels, Prediction
 from baselines.rotation import canonical_yaw
 
 GRIP = 9
 """Numbers of a grip: the tool z axis, then xx, yy, zz, and sqrt(2) times xy, yz, xz of the outer
 product, so that their distance is that of the matrices."""
 
+POSE = GRIP + 2
+"""Numbers of a pose: a grip, and the logits of gripper open and ignore collisions."""
+
 _ROWS, _COLUMNS = (0, 1, 2, 0, 1, 0), (0, 1, 2, 1, 2, 2)
 _SCALES = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
+
+
+@dataclass(frozen=True)
+class Regressed:
+    """A keyframe as a network regresses it."""
+
+    position_in_cube: Float[Tensor, "b 3"]
+    pose: Float[Tensor, "b 11"]
+
+    def terms(self, labels: Labels) -> dict[str, Tensor]:
+        """Losses of the pose, means over samples: squared error of the grip, cross-entropies."""
+        flags = {"bc/gripper": labels.gripper_open, "bc/collision": labels.ignore_collisions}
+        error = grip_error(self.pose[:, :GRIP], labels.quaternion_wxyz)
+        return {"bc/rotation": error.mean()} | {
+            name: functional.binary_cross_entropy_with_logits(logit, flag.float())
+            for (name, flag), logit in zip(flags.items(), self.pose[:, GRIP:].T, strict=True)
+        }
+
+    @property
+    def prediction(self) -> Prediction:
+        """The keyframe."""
+        return Prediction(
+            position_in_cube=self.position_in_cube,
+            quaternion_wxyz=grip_quaternion(self.pose[:, :GRIP]),
+            gripper_open=self.pose[:, GRIP] > 0,
+            ignore_collisions=self.pose[:, GRIP + 1] > 0,
+        )
 
 
 def grip_numbers(quaternion_wxyz: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 9"]:

@@ -72,7 +72,7 @@ def test_moving_everything_changes_no_score(network: Act3d) -> None:
         torch.testing.assert_close(after.ghosts_in_cube, before.ghosts_in_cube + shift)
         assert (after.scores - before.scores).abs().max() < 1e-5
         assert before.scores.std(dim=-1).min() > 1e-2, "a ghost's place matters"
-    torch.testing.assert_close(there.grip, here.grip, rtol=0, atol=1e-5)
+    torch.testing.assert_close(there.action.pose, here.action.pose, rtol=0, atol=1e-5)
 
 
 def test_moving_the_hand_alone_changes_scores(network: Act3d) -> None:
@@ -88,7 +88,7 @@ def test_words_change_scores_and_action(network: Act3d) -> None:
     before = detect(network, inputs, zero)
     after = detect(network, replace(inputs, text=-inputs.text), zero)
     assert (before.levels[0].scores - after.levels[0].scores).abs().max() > 1e-3
-    assert (before.grip - after.grip).abs().max() > 1e-3
+    assert (before.action.pose - after.action.pose).abs().max() > 1e-3
 
 
 def test_answers_are_the_same_every_time(network: Act3d) -> None:

@@ -125,7 +125,7 @@ def test_past_gradients_teach_the_encoder_and_change_nothing_else(episode: list)
         torch.manual_seed(0)
         networks.append(HiveFormer(replace(tiny(CPU), past_gradients=taught), TEXT))
     inputs = seen_by(networks[0], Moment(episode[2], before=episode[:2]))
-    choices = [network(inputs).position_in_cube for network in networks]
+    choices = [network(inputs).action.position_in_cube for network in networks]
     assert torch.equal(*choices)
     for choice in choices:
         choice.sum().backward()

@@ -61,7 +61,9 @@ def test_the_order_of_points_changes_nothing(network: PolarNet) -> None:
     parts = {name: getattr(moment.seen, name)[order] for name in names}
     shuffled = replace(moment, seen=replace(moment.seen, **parts))
     first, second = (make_inputs(network.sight, size=1, moments=[m]) for m in (moment, shuffled))
-    assert torch.equal(network(first).position_in_cube, network(second).position_in_cube)
+    assert torch.equal(
+        network(first).action.position_in_cube, network(second).action.position_in_cube
+    )
 
 
 @torch.no_grad()
@@ -71,9 +73,9 @@ def test_the_answer_moves_with_the_scene(network: PolarNet) -> None:
     seen = random_moments(1)[0].seen
     moments = Moment(seen), Moment(seen, Augmentation(0.0, shift_m))
     before, after = (network(make_inputs(network.sight, size=1, moments=[m])) for m in moments)
-    moved_m = (after.position_in_cube - before.position_in_cube) * HALF_SIDE_M
+    moved_m = (after.action.position_in_cube - before.action.position_in_cube) * HALF_SIDE_M
     np.testing.assert_allclose(moved_m[0], shift_m, atol=1e-5)
-    assert torch.allclose(before.grip, after.grip, atol=1e-5)
+    assert torch.allclose(before.action.pose, after.action.pose, atol=1e-5)
 
 
 @torch.no_grad()
@@ -84,7 +86,7 @@ def test_the_answer_depends_on(network: PolarNet, field: str) -> None:
     other = 1 - value if field == "proprio" else value + 1
     before, after = network(inputs), network(replace(inputs, **{field: other}))
     assert not torch.equal(before.heat, after.heat)
-    assert not torch.equal(before.grip, after.grip)
+    assert not torch.equal(before.action.pose, after.action.pose)
 
 
 def test_all_heat_on_one_point_answers_that_point_and_its_offset() -> None:
