@@ -27,7 +27,7 @@ from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.layers import ghosts
 from baselines.layers.attention import padding_bias
-from baselines.layers.regression import POSE, Regressed
+from baselines.layers.regression import POSE, UNTURNED, Regressed
 from baselines.layers.resnet import ResNet50
 from baselines.layers.rotary import Context, Reader, Turns, turns
 from baselines.layers.trunks import Pyramid, SmallTrunk, normalised
@@ -91,7 +91,9 @@ class Act3dConfig:
     label_spread_m: float = 0.01
     """Distance from the label at which a ghost's target falls by a factor e."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(lr=3e-3, precision="bf16"))
+    recipe: Recipe = field(
+        default_factory=lambda: Recipe(lr=3e-3, precision="bf16", augment=UNTURNED)
+    )
     """How to train (D-act3d-recipe)."""
 
     def __post_init__(self) -> None:

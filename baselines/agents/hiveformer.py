@@ -26,7 +26,7 @@ from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import attend, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
-from baselines.layers.regression import POSE, Regressed
+from baselines.layers.regression import POSE, UNTURNED, Regressed
 from baselines.layers.stems import leaky
 from baselines.layers.unet import UnetDecoder, UnetEncoder, replicated
 from baselines.policy import KeyframePolicy, load_policy
@@ -86,7 +86,7 @@ class HiveFormerConfig:
     position_weight: float = 100.0
     """Weight of the squared position error in square metres (D-hiveformer-recipe)."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16"))
+    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", augment=UNTURNED))
     """How to train."""
 
     def __post_init__(self) -> None:

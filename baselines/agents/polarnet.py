@@ -24,7 +24,7 @@ from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
-from baselines.layers.regression import POSE, Regressed
+from baselines.layers.regression import POSE, UNTURNED, Regressed
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
 from baselines.text import TextSpec
@@ -90,7 +90,7 @@ class PolarNetConfig:
     """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
     the grip's (D-polarnet-weights)."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16"))
+    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", augment=UNTURNED))
     """How to train."""
 
     def __post_init__(self) -> None:

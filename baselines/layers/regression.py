@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from baselines.batch import Labels, Prediction
 from baselines.rotation import canonical_yaw
+from baselines.scene.augment import AugmentConfig
 
 GRIP = 9
 """Numbers of a grip: the tool z axis, then xx, yy, zz, and sqrt(2) times xy, yz, xz of the outer
@@ -24,6 +25,10 @@ product, so that their distance is that of the matrices."""
 
 POSE = GRIP + 2
 """Numbers of a pose: a grip, and the logits of gripper open and ignore collisions."""
+
+UNTURNED = AugmentConfig(yaw_rad=0.0)
+"""How scenes are moved for agents that regress a pose: not turned, as in their own papers
+(D-unturned)."""
 
 _ROWS, _COLUMNS = (0, 1, 2, 0, 1, 0), (0, 1, 2, 1, 2, 2)
 _SCALES = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
