@@ -37,8 +37,8 @@ def restore(kind: type[C], values: Any, source: str, kinds: Mapping[str, type] |
 def _restore_value(hint: Any, value: Any, source: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return restore(typing.cast(type, hint), value, source)
-    if typing.get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(value)
+    if isinstance(value, list):  # JSON has no tuples, configs no lists
+        value = tuple(value)
     if not _fits(hint, value):
         raise UsageError(f"{source} cannot be {value!r}.")
     return value
@@ -50,6 +50,11 @@ def _fits(hint: Any, value: Any) -> bool:
         return value in arguments
     if origin in (typing.Union, types.UnionType):
         return any(_fits(argument, value) for argument in arguments)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        return len(kinds) == len(value) and all(map(_fits, kinds, value))
     if hint is float:
         return isinstance(value, int | float)
     return isinstance(value, hint) if isinstance(hint, type) else True

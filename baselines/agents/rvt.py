@@ -66,7 +66,7 @@ PAPER_RECIPE = Recipe(
     rotation_weight=1.0,
     rotation_sigma_bins=0.0,
     image_noise=0.1,
-    augment=AugmentConfig(rise_m=0.125),
+    augment=AugmentConfig(translation_m=0.125),
 )
 """The paper's section 4.1: 133K iterations, batch 18, LAMB at 1.8e-3, 2K steps of warm-up."""
 

@@ -22,12 +22,10 @@ class AugmentConfig:
     yaw_rad: float = np.pi / 4
     """Largest turn about the vertical, to either side."""
 
-    translation_m: float = 0.125
-    """Largest shift along x and along y, to either side."""
-
-    rise_m: float = 0.0
-    """Largest shift up or down. The table is equally high in all scenes, so that the height of an
-    object's top tells its size, unless shifts hide it (D-heights; the paper's 0.125)."""
+    translation_m: float | tuple[float, float, float] = (0.125, 0.125, 0.0)
+    """Largest shift to either side, along each axis or along all of them. The table is equally high
+    in all scenes, so that the height of an object's top tells its size, unless shifts up and down
+    hide it (D-heights; the paper shifts along all axes)."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,7 @@ def draw(
     that keeps the target inside (D-shift: RVT clamps, which piles labels up on the faces).
     """
     target = np.asarray(target_in_base, np.float64)
-    center = np.asarray(bounds.center_in_base)
-    reach = np.array([config.translation_m, config.translation_m, config.rise_m])
+    center, reach = np.asarray(bounds.center_in_base), np.broadcast_to(config.translation_m, 3)
     to_low = center - bounds.side_m / 2 - target
     to_high = center + bounds.side_m / 2 - target
     yaw_rad = rng.uniform(-config.yaw_rad, config.yaw_rad)

@@ -10,7 +10,7 @@ from sacil_tasks.interface import SCENE_BOUNDS
 
 CENTER, HALF = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2
 MIDDLE = CENTER + np.array([0.03, -0.05, 0.02])
-RISING = AugmentConfig(rise_m=0.125)
+RISING = AugmentConfig(translation_m=0.125)
 
 
 def moves(target, count=300, config=AugmentConfig()):  # noqa: B008

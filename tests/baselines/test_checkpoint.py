@@ -13,6 +13,7 @@ from baselines.batch import Inputs
 from baselines.checkpoint import CONFIG, MODEL, PROVENANCE, STATE, TEXT, Identity, TrainState
 from baselines.configs import restore
 from baselines.release import ReleaseConfig
+from baselines.scene.augment import AugmentConfig
 from baselines.scene.sight import Views
 from baselines.text import SentenceTable, TextSpec
 from sacil_tasks.catalog import suite_tasks
@@ -227,3 +228,10 @@ def test_config_values_are_checked():
     for field, value in (("batch", "16"), ("precision", "fp8"), ("augment", 3), ("lr", None)):
         with pytest.raises(UsageError, match=field):
             restore(Recipe, content | {field: value}, "here")
+
+
+@pytest.mark.parametrize("shifts", [[0.1, 0.1], [0.1, 0.1, "0"], [], "0.1"])
+def test_lists_are_checked_item_by_item(shifts):
+    content = asdict(AugmentConfig()) | {"translation_m": shifts}
+    with pytest.raises(UsageError, match="translation_m cannot be"):
+        restore(AugmentConfig, content, "here")
