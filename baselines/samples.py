@@ -123,7 +123,7 @@ class KeyframeSet:
 
     @classmethod
     def load(cls, folder: Path, tasks: Sequence[str]) -> "KeyframeSet":
-        """Read `<folder>/<task>.h5` of every task.
+        """Read `<task>.h5` of every task; `folder` is `<data>/<split>/<partition>/keyframes`.
 
         Raises:
             UsageError: a file is missing (says how to make it), truncated, foreign, or of another
@@ -132,14 +132,14 @@ class KeyframeSet:
         missing = [task for task in tasks if not (folder / f"{task}.h5").is_file()]
         if missing:
             raise UsageError(
-                f"no keyframes of {', '.join(missing)} in {folder}. " + _gen_demos(*missing)
+                f"no keyframes of {', '.join(missing)} in {folder}. " + _gen_demos(folder, *missing)
             )
         shards = [Shard.load(folder / f"{task}.h5") for task in tasks]
         for task, shard in zip(tasks, shards, strict=True):
             if shard.task != task:
                 raise UsageError(
                     f"{shard.path} holds keyframes of {shard.task}, not of {task}. Move it away. "
-                    + _gen_demos(task)
+                    + _gen_demos(folder, task)
                 )
         return cls(shards)
 
@@ -228,7 +228,7 @@ class KeyframeSet:
         if len(self.meaning_ids) == len(self.shards):
             raise UsageError(
                 "every task has demos of a single size only, so nothing about size can be learnt. "
-                + _gen_demos(*self.tasks)
+                + _gen_demos(self.shards[0].path.parent, *self.tasks)
             )
 
 
@@ -243,5 +243,10 @@ def _check_in_cube(path: Path, targets_in_base: Float32[np.ndarray, "m 3"]) -> N
         )
 
 
-def _gen_demos(*tasks: str) -> str:
-    return f"Run `python -m sacil_tasks.gen_demos --tasks {' '.join(tasks)}`."
+def _gen_demos(folder: Path, *tasks: str) -> str:
+    """The command that makes the keyframes of `<data>/<split>/<partition>/keyframes`."""
+    data, split, partition = folder.parents[2], folder.parts[-3], folder.parts[-2]
+    return (
+        f"Run `python -m sacil_tasks.gen_demos --tasks {' '.join(tasks)} --split {split} "
+        f"--partition {partition} --out {data}`."
+    )

@@ -26,8 +26,10 @@ from baselines.rotation import multiply
 from baselines.samples import KeyframeSet, Sample, Shard
 from baselines.scene.views import base_from_cube
 from sacil_tasks.aim import nearest
-from sacil_tasks.errors import run_command
+from sacil_tasks.catalog import task_names, task_spec
+from sacil_tasks.errors import UsageError, run_command
 from sacil_tasks.sizes import LABELS
+from sacil_tasks.splits import check_split
 
 ROTATION_DEG = 5.0
 """A rotation is right within one bin."""
@@ -60,8 +62,13 @@ def main(config: ValidateConfig) -> None:
     """Print the scores of each task.
 
     Raises:
-        UsageError: a checkpoint or keyframes are missing, damaged or do not fit.
+        UsageError: a task or split is unknown, or a checkpoint or keyframes are missing, damaged
+            or do not fit.
     """
+    if not config.tasks:
+        raise UsageError(f"--tasks names none. Name some of {', '.join(task_names())}.")
+    for task in config.tasks:
+        check_split(task_spec(task), config.split)
     folder = config.checkpoint or find_released(config.agent, config.tasks)
     trained = checkpoint.load(folder, agent=config.agent, tasks=config.tasks)
     keyframes = KeyframeSet.load(

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import unwritable
+from sacil_tasks.files import unwritable, whole_lines
 
 SCHEMA_VERSION = 1
 EPISODES_FILE = "episodes.jsonl"
@@ -164,7 +164,7 @@ class EpisodeLog:
             ) from error
         self.path = path
         self.records = read_records(path)
-        self._drop_cut_line()  # only now: a foreign file is left as it is
+        self._drop_cut_line()
 
     def append(self, record: EpisodeRecord) -> None:
         """Write one line to disk.
@@ -184,8 +184,13 @@ class EpisodeLog:
 
     def _drop_cut_line(self) -> None:
         self._stream.seek(0)
-        content = self._stream.read()
-        self._stream.truncate(content.rfind(b"\n") + 1)
+        try:
+            whole = whole_lines(self._stream.read(), b'{"task":"')
+        except ValueError as error:  # a foreign file is left as it is
+            raise UsageError(
+                f"{self.path} is no episode log: {error}. Move it away, or choose another folder."
+            ) from error
+        self._stream.truncate(len(whole))
 
     def __enter__(self) -> Self:
         """Nothing to do: opening is the constructor's."""

@@ -28,7 +28,15 @@ from tqdm import tqdm
 from sacil_tasks import verdicts
 from sacil_tasks.catalog import suite_tasks, task_spec
 from sacil_tasks.errors import UsageError, run_command
-from sacil_tasks.files import atomic_path, content_hash, file_sha256
+from sacil_tasks.files import (
+    atomic_path,
+    content_hash,
+    file_sha256,
+    sole_writer,
+    unwritable,
+    whole_lines,
+)
+from sacil_tasks.splits import plan_splits
 from sacil_tasks.verdicts import Finding, Row
 from sacil_tasks.workers import JobFailure, run_jobs
 
@@ -64,8 +72,8 @@ class AuditConfig:
     checks: tuple[Check, ...] = get_args(Check)
     """What to check; without it, everything."""
 
-    splits: tuple[SizeSplit, ...] = get_args(SizeSplit)
-    """Size splits that are looked at and played; a task without one is passed over."""
+    splits: tuple[SizeSplit, ...] = ()
+    """Size splits that are looked at and played; without it, all that a task has."""
 
     resets: int = 5000
     """Scenes that the shortcut classifiers see, per task."""
@@ -90,13 +98,15 @@ def main(config: AuditConfig) -> None:
     """Run what is missing, write the findings and print them.
 
     Raises:
-        UsageError: a name or number is wrong, a trial broke off, or something does not hold.
+        UsageError: a name or number is wrong, another audit writes there, a trial broke off, or
+            something does not hold.
     """
     trials = plan(config)
-    log = TrialLog(config.out)
-    failures = _run([trial for trial in trials if trial not in log.rows], log, config.workers)
-    found = findings(config, trials, log)
-    _write(config.out / FINDINGS_FILE, found)
+    with sole_writer(config.out):
+        log = TrialLog(config.out)
+        failures = _run([trial for trial in trials if trial not in log.rows], log, config.workers)
+        found = findings(config, trials, log)
+        _write(config.out / FINDINGS_FILE, found)
     print(_table(found))
     print(f"Written: {config.out / FINDINGS_FILE} and {TRIALS_FILE}")
     if failures:
@@ -112,10 +122,13 @@ def plan(config: AuditConfig) -> list[Trial]:
     """All trials that the simulator is needed for.
 
     Raises:
-        UsageError: a name or number is wrong.
+        UsageError: a name or number is wrong, or a task that was named lacks a split.
     """
     if min(config.resets, config.looks, config.scripts, config.scenes, config.workers) < 1:
         raise UsageError("--resets, --looks, --scripts, --scenes and --workers are at least 1.")
+    if not config.checks:
+        raise UsageError(f"--checks names none. Name some of {', '.join(get_args(Check))}.")
+    _size_splits(config)
     counts = {
         "shortcuts": config.resets,
         "looks": config.looks,
@@ -160,14 +173,10 @@ class TrialLog:
         self.rows: dict[Trial, list[Row]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            whole = self._path.read_bytes() if self._path.exists() else b""
-            whole = whole[: whole.rfind(b"\n") + 1]
-            with self._path.open("a+b") as stream:
-                stream.truncate(len(whole))
+            content = self._path.read_bytes() if self._path.exists() else b""
         except OSError as error:
-            raise _unwritable(self._path, error) from error
-        for line in whole.splitlines():
-            self._read(line)
+            raise unwritable(self._path, error) from error
+        self._cut(self._read(content))
 
     def append(self, trial: Trial, rows: list[Row]) -> None:
         """Keep a finished trial.
@@ -180,19 +189,30 @@ class TrialLog:
             with self._path.open("a") as stream:
                 stream.write(line + "\n")
         except OSError as error:
-            raise _unwritable(self._path, error) from error
+            raise unwritable(self._path, error) from error
         self.rows[trial] = rows
 
-    def _read(self, line: bytes) -> None:
+    def _read(self, content: bytes) -> int:
+        """Take in all whole lines; returns how many bytes they are."""
         try:
-            content = json.loads(line)
-            if content["code"] == code_hash():
-                self.rows[Trial(*content["trial"])] = content["rows"]
+            whole = whole_lines(content, b'{"code": "')
+            for line in map(json.loads, whole.splitlines()):
+                if line["code"] == code_hash():
+                    self.rows[Trial(*line["trial"])] = line["rows"]
         except (ValueError, KeyError, TypeError) as error:
             raise UsageError(
                 f"{self._path} is not a log of this command ({error}). "
                 "Move it away or choose another folder with --out."
             ) from error
+        return len(whole)
+
+    def _cut(self, length: int) -> None:
+        """Only once the file is known to be ours."""
+        try:
+            with self._path.open("a+b") as stream:
+                stream.truncate(length)
+        except OSError as error:
+            raise unwritable(self._path, error) from error
 
 
 @cache
@@ -226,7 +246,18 @@ def _tasks(config: AuditConfig) -> tuple[str, ...]:
 def _splits(config: AuditConfig, task: str, check: str) -> tuple[str, ...]:
     if check in ("shortcuts", "scripts"):
         return ("canon",)
-    return tuple(split for split in config.splits if split in task_spec(task).splits)
+    return tuple(split for name, split in _size_splits(config) if name == task)
+
+
+def _size_splits(config: AuditConfig) -> list[tuple[str, str]]:
+    """Tasks with each of their splits.
+
+    Raises:
+        UsageError: a task and a split were named, but the task does not have it.
+    """
+    specs = [task_spec(name) for name in _tasks(config)]
+    names = config.splits or get_args(SizeSplit)
+    return plan_splits(specs, names, strict=bool(config.tasks and config.splits))[0]
 
 
 _JUDGES: dict[str, Callable[[str, str, Sequence[Row]], list[Finding]]] = {
@@ -258,12 +289,6 @@ def _cells(found: Sequence[Finding]) -> Iterator[tuple[str, ...]]:
     for it in found:
         answer = "yes" if it.holds else "NO"
         yield (it.check, it.task, it.split, it.what, it.measured, it.needed, answer)
-
-
-def _unwritable(path: Path, error: OSError) -> UsageError:
-    return UsageError(
-        f"cannot write {path}: {error.strerror or error}. Choose another folder with --out."
-    )
 
 
 if __name__ == "__main__":

@@ -54,6 +54,19 @@ def atomic_hdf5(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.Fil
         draft.write_bytes(image)
 
 
+def whole_lines(content: bytes, opening: bytes) -> bytes:
+    """A log's content less a last line that a kill cut off; every line starts with `opening`.
+
+    Raises:
+        ValueError: what stands after the last newline is not the beginning of such a line.
+    """
+    end = content.rfind(b"\n") + 1
+    cut = content[end:]
+    if cut[: len(opening)] != opening[: len(cut)]:
+        raise ValueError("its last line is not of this command")
+    return content[:end]
+
+
 def unwritable(path: Path, error: OSError) -> UsageError:
     """The sentence for a file that could not be written."""
     return UsageError(

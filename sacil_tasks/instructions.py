@@ -86,7 +86,8 @@ def check_template(spec: TaskSpec, template: int) -> None:
         UsageError: there is no such template.
     """
     count = len(all_templates(spec))
-    if isinstance(template, bool) or not isinstance(template, int) or not 0 <= template < count:
+    whole = isinstance(template, int | np.integer) and not isinstance(template, bool)
+    if not whole or not 0 <= template < count:
         raise UsageError(
             f"{spec.name} has templates 0 to {count - 1}, but {template!r} came; take one of them."
         )

@@ -56,9 +56,11 @@ def main(config: ReplayConfig) -> None:
             f"no trajectory.h5 in or below {config.demos}. "
             "Make demos with `python -m sacil_tasks.gen_demos`."
         )
+    if config.count is not None and config.count < 1:
+        raise UsageError(f"--count is at least 1, not {config.count}.")
     work = [(folder, read_records(folder)[: config.count]) for folder in folders]
-    for folder in folders:
-        _env_info(folder)
+    for folder, records in work:
+        _check(folder, records)
     results = []
     with tqdm(
         total=sum(len(records) for _, records in work),
@@ -115,6 +117,20 @@ def _env_info(folder: Path) -> dict[str, Any]:
             "of ours. Replay them with `python -m mani_skill.trajectory.replay_trajectory`."
         )
     return info
+
+
+def _check(folder: Path, records: list[dict[str, Any]]) -> None:
+    """Find what would stop a replay before it starts.
+
+    Raises:
+        UsageError: the demos are of a foreign task, or there are none, or one lacks its reset.
+    """
+    info = _env_info(folder)
+    if not records or "env_kwargs" not in info or any("reset_kwargs" not in r for r in records):
+        raise UsageError(
+            f"{folder / 'trajectory.json'} lists no demos, or not how their scenes are made. "
+            "Delete the folder and run `python -m sacil_tasks.gen_demos` again."
+        )
 
 
 def _points_m(env: Any) -> Float[np.ndarray, "4 3"]:

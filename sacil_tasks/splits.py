@@ -158,9 +158,12 @@ def plan_splits(
     `strict`: the tasks were named one by one, so that a pair that does not exist is a mistake.
 
     Raises:
-        UsageError: a split is unknown, or a pair does not exist although it was asked for.
+        UsageError: a split is unknown or none is named, or a pair does not exist although it was
+            asked for.
     """
     specs, splits = list(tasks), expand(names)
+    if not splits:
+        raise UsageError(f"no split is named. Name some of {', '.join(SPLITS)}.")
     reasons = {(spec.name, split): why_not(spec, split) for spec in specs for split in splits}
     missing = {pair: reason for pair, reason in reasons.items() if reason is not None}
     pairs = [pair for pair, reason in reasons.items() if reason is None]

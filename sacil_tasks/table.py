@@ -253,7 +253,9 @@ class SizedTableEnv(BaseEnv):
         scenes.check_seeds(seeds, self.num_envs)
         self._check_options(options or {})
         gym.Env.reset(self, seed=seeds[0] if seeds else None)  # sets np_random
-        return super().reset(seed, options)
+        # Far from the scene's own streams: the first numbers after the seed tell the sizes.
+        self._np_random = np.random.Generator(self.np_random.bit_generator.jumped())
+        return super().reset(seed if seeds else None, options)
 
     def _check_options(self, options: dict[str, Any]) -> None:
         wording.check_names(options, self.RESET_OPTIONS)
@@ -414,8 +416,6 @@ class SizedTableEnv(BaseEnv):
                 own[env_idx] = saved.view(-1, own.shape[1])
             self.events.set_state(state["task"], env_idx)
             self._find_targets()
-
-    # Helpers -------------------------------------------------------------------------------------
 
     def _to_tensor(self, rows: list[np.ndarray]) -> Float[Tensor, "n ..."]:
         """Stack rows drawn by numpy."""

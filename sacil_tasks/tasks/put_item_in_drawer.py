@@ -9,6 +9,7 @@ from mani_skill.utils.structs import Actor, Articulation, Link
 from torch import Tensor
 
 from sacil_tasks import fixtures, props
+from sacil_tasks.errors import UsageError
 from sacil_tasks.events import append_order
 from sacil_tasks.interface import Keyframe
 from sacil_tasks.placing import PlacingEnv, seen_from
@@ -101,6 +102,11 @@ class PutItemInDrawerEnv(PlacingEnv):
     def _load_extras(self) -> None:
         self.fixture = fixtures.build_cabinet(self.scene, "cabinet")
         self.drawers = [self.fixture.links_map[name] for name in fixtures.HANDLE_HEIGHTS_M]
+
+    def _check_options(self, options: dict[str, Any]) -> None:
+        super()._check_options(options)
+        if not isinstance(opened := options.get("drawer_open", False), bool):
+            raise UsageError(f"drawer_open is True or False, but {opened!r} came.")
 
     def _create_state(
         self, labels: Int64[np.ndarray, "b 3"], sizes_m: Float64[np.ndarray, "b 3"]

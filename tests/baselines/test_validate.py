@@ -11,8 +11,9 @@ from baselines.samples import KeyframeSet
 from baselines.scene.sight import ViewSight
 from baselines.scene.views import cube_from_base
 from baselines.text import SentenceTable, TextSpec, tidy
-from baselines.validate import grip_angle_deg, validate
+from baselines.validate import ValidateConfig, grip_angle_deg, main, validate
 from sacil_tasks.aim import REACH_M, nearest
+from sacil_tasks.errors import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,20 @@ class Cheat(Network):
             self.labels.gripper_open[rows].bool(),
             self.labels.ignore_collisions[rows].bool(),
         )
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"tasks": ()}, "--tasks names none"),
+        ({"tasks": ("pick_upcup",)}, "Did you mean pick_up_cup"),
+        ({"split": "shift_upp"}, "Did you mean shift_up"),
+        ({"tasks": ("pick_up_cup",), "split": "shift_up"}, "pick_up_cup has no split shift_up"),
+    ],
+)
+def test_a_wrong_name_is_one_sentence(changes, sentence):
+    with pytest.raises(UsageError, match=sentence):
+        main(ValidateConfig(**changes))
 
 
 @pytest.mark.parametrize("batch", [2, 16])

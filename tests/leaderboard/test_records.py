@@ -47,6 +47,13 @@ def test_a_foreign_line_is_refused_and_left_alone(run_folder, junk):
     assert log.read_text() == content
 
 
+def test_a_foreign_file_without_a_whole_line_is_refused_and_left_alone(tmp_path):
+    (tmp_path / EPISODES_FILE).write_text("no end of line")
+    with pytest.raises(UsageError, match="no episode log"):
+        EpisodeLog(tmp_path)
+    assert (tmp_path / EPISODES_FILE).read_text() == "no end of line"
+
+
 def test_an_episode_twice_is_refused(run_folder):
     log = run_folder / EPISODES_FILE
     log.write_text(log.read_text() * 2)

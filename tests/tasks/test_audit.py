@@ -12,6 +12,7 @@ from sacil_tasks.audit import AuditConfig, Trial, TrialLog
 from sacil_tasks.catalog import task_names, task_spec
 from sacil_tasks.contents import draw_contents
 from sacil_tasks.errors import UsageError
+from sacil_tasks.files import sole_writer
 from sacil_tasks.instructions import variations
 from sacil_tasks.scenes import draw_layout, scene_seed
 from sacil_tasks.shortcuts import Scenes, cross_fitted_accuracy, guesses, limit
@@ -149,6 +150,8 @@ def test_changed_pixels_and_sizes_alike_are_found() -> None:
         ({"tasks": ("pick_and_lfit",)}, "Did you mean pick_and_lift"),
         ({"suite": "singel"}, "Did you mean single"),
         ({"resets": 0}, "at least 1"),
+        ({"checks": ()}, "--checks names none"),
+        ({"tasks": ("pick_up_cup",), "splits": ("shift_up",)}, "pick_up_cup has no split shift_up"),
     ],
 )
 def test_a_wrong_word_is_one_sentence_before_anything_starts(changes, sentence, tmp_path) -> None:
@@ -166,9 +169,25 @@ def test_a_cut_line_is_dropped_other_code_not_counted_and_foreign_files_refused(
     older = json.loads(path.read_text()) | {"code": "older"}
     path.write_text(json.dumps(older) + "\n")
     assert TrialLog(tmp_path).rows == {}
-    path.write_text("notes\n")
+
+
+@pytest.mark.parametrize("notes", ["notes\n", "no end of line", '{"my": "own"}', "two\nlines"])
+def test_a_foreign_file_is_refused_and_left_as_it_is(tmp_path, notes) -> None:
+    path = tmp_path / audit.TRIALS_FILE
+    path.write_text(notes)
     with pytest.raises(UsageError, match="not a log of this command"):
         TrialLog(tmp_path)
+    assert path.read_text() == notes
+
+
+def test_two_audits_do_not_share_a_folder(tmp_path) -> None:
+    with sole_writer(tmp_path), pytest.raises(UsageError, match="another run is writing"):
+        audit.main(AuditConfig(tasks=("pick_up_cup",), checks=("oracles",), out=tmp_path))
+
+
+def test_a_split_named_twice_is_played_once() -> None:
+    once, twice = (AuditConfig(checks=("expert",), splits=("canon",) * n) for n in (1, 2))
+    assert audit.plan(once) == audit.plan(twice)
 
 
 @pytest.mark.sim

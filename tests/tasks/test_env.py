@@ -167,6 +167,17 @@ def test_every_split_says_what_the_registry_says(env: SizedTableEnv) -> None:
     assert len(held_out | {words["canon"]}) == 4
 
 
+def test_the_environments_generator_does_not_tell_the_sizes(env: SizedTableEnv) -> None:
+    alike = 0
+    for seed in range(20):
+        env.reset(seed=seed)
+        order = env.np_random.permutation(3)
+        alike += all(
+            sizes.LABELS[k] == label for k, label in zip(order, env.candidate_labels, strict=True)
+        )
+    assert alike < 12
+
+
 def test_unsupported_splits_and_options_are_refused(env: SizedTableEnv) -> None:
     for split in set(SPLITS) - set(env.task.splits):
         with pytest.raises(UsageError, match=f"{env.task.name} has no split {split}"):

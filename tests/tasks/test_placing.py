@@ -10,6 +10,7 @@ import sapien
 
 from sacil_tasks import fixtures
 from sacil_tasks.catalog import env_id
+from sacil_tasks.errors import UsageError
 from sacil_tasks.outcomes import Outcome
 from sacil_tasks.placing import PlacingEnv
 from sacil_tasks.props import cup_height_m, pepper_height_m
@@ -173,6 +174,11 @@ def test_the_named_drawer_can_be_open_from_the_start(items: PlacingEnv, named: s
         items.reset(seed=3, options={"slots": slots, "drawer_open": wanted})
         opened = [OPENING_M * (wanted and name == named) for name in DRAWERS]
         assert items.fixture.qpos[0].tolist() == pytest.approx(opened, abs=1e-6)
+
+
+def test_a_drawer_is_open_or_not(items: PlacingEnv) -> None:
+    with pytest.raises(UsageError, match="True or False"):
+        items.reset(seed=3, options={"drawer_open": "no"})
 
 
 def test_only_fingers_on_candidates_and_the_named_handle_are_clean(items: PlacingEnv) -> None:

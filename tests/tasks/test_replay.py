@@ -10,6 +10,7 @@ import h5py
 import pytest
 
 from sacil_tasks import gen_demos, replay
+from sacil_tasks.catalog import env_id
 from sacil_tasks.errors import UsageError
 from sacil_tasks.gen_demos import GenConfig
 from sacil_tasks.keyframes import KeyframeFile
@@ -121,6 +122,25 @@ def test_trajectories_that_are_listed_but_missing_are_counted(made_up):
         file["somebody else's"] = 1
     with pytest.raises(UsageError, match="lacks 1 trajectories"):
         replay.main(ReplayConfig(demos=made_up))
+
+
+@pytest.mark.parametrize(
+    ("episodes", "env_info"),
+    [([], {"env_kwargs": {}}), ([{"episode_id": 0}], {"env_kwargs": {}}), (None, {})],
+)
+def test_a_list_without_demos_or_resets_is_one_sentence(made_up, episodes, env_info):
+    content = json.loads((made_up / "trajectory.json").read_text())
+    content["env_info"] = env_info | {"env_id": f"sacil_tasks:{env_id(TASK)}"}
+    content["episodes"] = content["episodes"] if episodes is None else episodes
+    (made_up / "trajectory.json").write_text(json.dumps(content))
+    with pytest.raises(UsageError, match="lists no demos, or not how"):
+        replay.main(ReplayConfig(demos=made_up))
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_a_count_below_one_is_refused(made_up, count):
+    with pytest.raises(UsageError, match="--count is at least 1"):
+        replay.main(ReplayConfig(demos=made_up, count=count))
 
 
 def test_a_recording_of_another_environment_is_one_sentence(made_up):
