@@ -85,7 +85,7 @@ class PutItemInDrawerEnv(PlacingEnv):
 
     **Success Conditions:**
     - the named cube was picked up, is at rest inside the named drawer and is let go
-    - no other cube is in a drawer
+    - no other cube is in a drawer; drawers that were not named may be open
     - strictly: no other cube was acquired or displaced
     """
 

@@ -46,7 +46,7 @@ class PutItemsInDrawerEnv(PutItemInDrawerEnv):
     **Success Conditions:**
     - both named cubes were picked up in the order named, are at rest inside the named drawer and
       are let go
-    - the third is in no drawer
+    - the third is in no drawer; drawers that were not named may be open
     - strictly: the third was neither acquired nor displaced
     """
 
