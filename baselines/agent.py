@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from baselines.batch import Batch, Inputs, Prediction
@@ -101,6 +102,11 @@ class Network(nn.Module):
 
     needs_goals: bool = False
     """Whether `loss` reads `Batch.goal`."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self.parameters()).device
 
     def load_pretrained(self) -> None:
         """Read weights made elsewhere, if there are any; called when a training run begins.
