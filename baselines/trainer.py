@@ -68,8 +68,7 @@ def shared_loss(network: Network) -> Loss:
             "number of processes.",
             ", ".join(names),
         )
-    # Buffers are statistics of batch norm, which training only writes: the first rank's are saved.
-    return DistributedDataParallel(_Loss(network), broadcast_buffers=False)
+    return DistributedDataParallel(_Loss(network))
 
 
 class Trainer:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,6 +12,7 @@ import pytest
 import torch
 from networks import TEXT, gradients, registered
 from safetensors.torch import load_file
+from torch import distributed
 
 from baselines.agent import find_agent
 from baselines.checkpoint import METRICS, MODEL, PROVENANCE
@@ -24,29 +24,34 @@ HERE = Path(__file__).parent
 TIMING = ("samples_per_s", "cpu_s", "share_loading", "share_network", "share_optimiser")
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.fixture(scope="module")
 def two_ranks(data, tmp_path_factory):
     """The folder that two ranks leave, and what each said before it ended."""
     out = tmp_path_factory.mktemp("two")
-    paths = os.pathsep.join(map(str, (HERE, HERE.parent, HERE.parents[1])))
-    shared = {"PYTHONPATH": paths, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    # As under torchrun, what the ranks meet at outlives them.
+    store = distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    shared = {
+        "PYTHONPATH": os.pathsep.join(map(str, (HERE, HERE.parent, HERE.parents[1]))),
+        "TORCHELASTIC_USE_AGENT_STORE": "True",
+        "MASTER_ADDR": store.host,
+        "MASTER_PORT": str(store.port),
+        "WORLD_SIZE": "2",
+    }
     processes = [
         subprocess.Popen(
             [sys.executable, HERE / "one_of_two.py", data, out],
-            env=os.environ | shared | {"WORLD_SIZE": "2", "RANK": rank, "LOCAL_RANK": rank},
+            env=os.environ | shared | {"RANK": rank, "LOCAL_RANK": rank},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         for rank in "01"
     ]
-    said = [process.communicate(timeout=200) for process in processes]
+    try:
+        said = [process.communicate(timeout=280) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
     return out, said, [process.returncode for process in processes]
 
 
