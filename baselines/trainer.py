@@ -58,7 +58,8 @@ def shared_loss(network: Network) -> Loss:
 
     Losses are means over samples, or are computed of all ranks' samples on each rank
     (`distributed.gathered`), so that is the gradient of the whole batch. Batch norm is the
-    exception: its layers are named in a warning.
+    exception: its layers are named in a warning. Gradients are shared as long as the function that
+    is returned lives.
     """
     if ranks() == 1:
         return network.loss

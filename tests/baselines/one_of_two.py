@@ -63,7 +63,8 @@ def learn_from_a_share(name: str, out: Path) -> None:
     network = network_of(name)
     if batch_norms(network):
         return
-    loss, terms = shared_loss(network)(rows(batch_of(network), share(4)))
+    taught = shared_loss(network)
+    loss, terms = taught(rows(batch_of(network), share(4)))
     loss.backward()
     found = averaged({"loss": loss.item()} | {n: term.item() for n, term in terms.items()})
     if rank() == 0:
