@@ -111,6 +111,11 @@ class Network(nn.Module):
     needs_goals: bool = False
     """Whether `loss` reads `Batch.goal`."""
 
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self.parameters()).device
+
     def load_pretrained(self) -> None:
         """Read weights made elsewhere, if there are any; called when a training run begins.
 

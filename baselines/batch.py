@@ -3,14 +3,17 @@
 Positions are in cube coordinates ([-1, 1] on each axis spans `interface.SCENE_BOUNDS`).
 """
 
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Generic, TypeVar
 
+import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 Scene = TypeVar("Scene")
 """What the network's `Sight` makes of an observation: a dataclass of tensors."""
+
+P = TypeVar("P")
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,17 @@ class Prediction:
     quaternion_wxyz: Float[Tensor, "b 4"]
     gripper_open: Bool[Tensor, "b"]
     ignore_collisions: Bool[Tensor, "b"]
+
+
+def moved(part: P, device: torch.device) -> P:
+    """A dataclass of tensors, nested ones too, on `device`; what is no tensor stays."""
+    part_or_any: Any = part
+    if isinstance(part_or_any, Tensor):
+        return part_or_any.to(device)
+    if is_dataclass(part_or_any):
+        names = [field.name for field in fields(part_or_any)]
+        return replace(part_or_any, **{n: moved(getattr(part_or_any, n), device) for n in names})
+    return part
 
 
 def proprio(*, gripper_open: bool, step: int, max_steps: int) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from baselines.agent import Recipe
 from baselines.batch import Batch, Inputs, Labels, proprio
+from baselines.distributed import share
 from baselines.rotation import canonical_yaw, quaternion_to_bins
 from baselines.samples import KeyframeSet, Sample, stream
 from baselines.scene import augment
@@ -45,15 +46,17 @@ class Loader:
         self._text_length = max(len(text[sentence]) for sentence in sentences)
 
     def batch(self, step: int) -> Batch:
-        """The training batch of `step`: a pure function of the seed and `step`.
+        """This rank's share of the training batch of `step`: a pure function of seed and `step`.
 
-        Goals have their own random stream (D-goal), so they never change what behaviour cloning
-        sees.
+        Every rank draws all rows and moves, so that they do not depend on the number of ranks, and
+        makes tensors of its own. Goals have their own random stream (D-goal), so they never change
+        what behaviour cloning sees.
         """
         rng = stream(self._seed, step, "rows")
         samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.choice_share)
-        goals = self._moved(self._next(samples), step, "goals") if self._goals else None
-        return self._assemble(samples, self._moved(samples, step, "moves"), goals)
+        own, shown = share(len(samples)), self._moved(samples, step, "moves")
+        goals = self._moved(self._next(samples), step, "goals")[own] if self._goals else None
+        return self._assemble(samples[own], shown[own], goals)
 
     def plain(self, samples: Sequence[Sample]) -> Batch:
         """A batch of these samples without augmentation or goals."""

@@ -9,6 +9,7 @@ import torch
 
 from baselines.agent import find_agent
 from baselines.checkpoint import Identity
+from baselines.distributed import first_rank_first, own_device, rank, share
 from baselines.loader import Loader
 from baselines.options import Job
 from baselines.run import Validator
@@ -33,17 +34,22 @@ class Material:
     identity: Identity
     keyframes: KeyframeSet
     text: SentenceTable
+    device: torch.device
 
     @classmethod
     def load(cls, job: Job) -> "Material":
         """Read the keyframe files.
 
         Raises:
-            UsageError: files are missing or damaged, or the text encoder is needed but missing.
+            UsageError: files are missing or damaged, the text encoder is needed but missing, or
+                batches or GPUs cannot be shared by the processes.
         """
         options = job.options
+        share(job.config.recipe.batch)
+        device = own_device(options.device)
         keyframes = KeyframeSet.load(_keyframes(options.data, "train"), options.chosen_tasks)
-        text = cached_table(job.config.recipe.text, sentences_of(keyframes))
+        with first_rank_first():  # sentences are embedded once
+            text = cached_table(job.config.recipe.text, sentences_of(keyframes))
         spec, variant = find_agent(options.agent)
         identity = Identity(
             agent=spec.name,
@@ -53,7 +59,7 @@ class Material:
             text=text.spec,
             config=job.config,
         )
-        return cls(job, identity, keyframes, text)
+        return cls(job, identity, keyframes, text, device)
 
     def trainer(self, steps: int) -> Trainer:
         """A trainer at step 0; the same every time."""
@@ -61,6 +67,7 @@ class Material:
         torch.manual_seed(seed)
         network = self.identity.create()
         network.load_pretrained()
+        network.to(self.device)
         loader = Loader(
             self.keyframes,
             self.text,
@@ -72,7 +79,12 @@ class Material:
         return Trainer(network, loader, self.job.config.recipe, steps=steps, seed=seed)
 
     def validator(self, sight: Sight) -> Validator | None:
-        """Scores on the `val` demos of these tasks, or None where there are none."""
+        """Scores on the `val` demos of these tasks, or None where there are none.
+
+        The first rank alone validates.
+        """
+        if rank() > 0:
+            return None
         folder = _keyframes(self.job.options.data, "val")
         tasks = [task for task in self.keyframes.tasks if (folder / f"{task}.h5").is_file()]
         if not tasks:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from baselines.agent import find_agent
+from baselines.distributed import Device
 from sacil_tasks.catalog import suite_tasks, task_names
 from sacil_tasks.errors import UsageError, find_name
 
@@ -18,7 +19,9 @@ ABOUT = """Train an agent on keyframe files, or complete a run that was stopped.
 
 Reads data/canon/train/keyframes/<task>.h5 and writes a checkpoint folder. Where
 data/canon/val/keyframes exists, scores on its demos go into metrics.jsonl. Every field of the
-agent's config is a flag: `--agent NAME --help` lists them. The simulator is never started."""
+agent's config is a flag: `--agent NAME --help` lists them. The simulator is never started.
+
+`torchrun --nproc_per_node N -m baselines.train ...` shares every batch among N processes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +63,9 @@ class TrainConfig:
 
     threads: int = 1
     """Threads of torch; two runs with one thread each do more than one run with two."""
+
+    device: Device = "auto"
+    """Where to train; `auto` takes a GPU where there is one, under torchrun one a process."""
 
     validate_every: int = 1000
     """Steps between validations; 0 for none."""

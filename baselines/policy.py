@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from baselines import checkpoint as checkpoints
-from baselines.batch import Prediction
+from baselines.batch import Prediction, moved
 from baselines.checkpoint import Checkpoint
 from baselines.loader import inputs_of
 from baselines.scene.sight import Moment
@@ -53,7 +53,8 @@ class KeyframePolicy:
         pairs = list(zip(observations, memories, strict=True))
         moments = [Moment(seen, before=memory.before) for seen, memory in pairs]
         words = pad([memory.tokens for memory in memories])
-        prediction = self._network.act(inputs_of(self._network.sight, moments, *words))
+        inputs = inputs_of(self._network.sight, moments, *words)
+        prediction = self._network.act(moved(inputs, self._network.device))
         return _keyframes(prediction), [self._remembering(*pair) for pair in pairs]
 
     def _remembering(self, seen: Observation, memory: Memory) -> Memory:

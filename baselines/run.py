@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from baselines.agent import Network
 from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
+from baselines.distributed import anywhere, averaged, device_name, rank, ranks, wait_for_all
 from baselines.trainer import Trainer
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import atomic_path, code_version, unwritable, write_json
@@ -57,7 +58,10 @@ class Means:
 
 
 class Run:
-    """A trainer and its folder: carries a run to its end, or as far as it is let."""
+    """A trainer and its folder: carries a run to its end, or as far as it is let.
+
+    Every rank has one; the first alone writes.
+    """
 
     def __init__(
         self, trainer: Trainer, folder: Path, plan: Mapping[str, Any], *, validate: Validator | None
@@ -84,7 +88,8 @@ class Run:
                 f"{self.folder} holds the state of another network. Choose another --out."
             ) from error
         self.wall_s, self.cpu_s = state.wall_s, state.cpu_s
-        trim_metrics(self.folder / METRICS, state.step)
+        if rank() == 0:
+            trim_metrics(self.folder / METRICS, state.step)
 
     def save(self) -> None:
         """Save the weights to evaluate and what is behind them, then the state.
@@ -96,6 +101,8 @@ class Run:
         """
         trainer = self.trainer
         trainer.check_finite()
+        if rank() > 0:
+            return
         save_weights(self.folder, trainer.averaged)
         write_json(self.folder / PROVENANCE, self._provenance())
         TrainState(
@@ -118,13 +125,15 @@ class Run:
             initial=trainer.step, total=trainer.steps, unit="step", mininterval=1.0, disable=None
         )
         done = trainer.step == trainer.steps
-        with bar, deferred_signals() as stopped:
+        with bar, deferred_signals() as signals:
+            stopped = False
             while not (done or stopped):
                 self._advance()
                 bar.update()
                 done = trainer.step == trainer.steps
                 if validate_every and (done or trainer.step % validate_every == 0):
                     self._log_validation()
+                stopped = anywhere(bool(signals))
                 # State is saved only where a line is logged, so that the lines of a killed and
                 # resumed run are those of an unbroken one.
                 if done or stopped or trainer.step % LOG_EVERY == 0:
@@ -132,15 +141,18 @@ class Run:
                     if done or stopped or time.monotonic() - saved > SAVE_EVERY_S:
                         self.save()
                         saved = time.monotonic()
+            wait_for_all()  # torchrun ends all ranks as soon as one leaves a stopped run
         if stopped and not done:
             log.info("saved step %d of %d in %s", trainer.step, trainer.steps, self.folder)
             raise KeyboardInterrupt
 
     def _advance(self) -> None:
         wall, cpu = time.perf_counter(), time.process_time()
-        self._means.add(self.trainer.advance())
+        own = self.trainer.advance()
+        terms = averaged(own | {"cpu_s": time.process_time() - cpu})
+        self.cpu_s += ranks() * terms.pop("cpu_s")
+        self._means.add(terms)
         self.wall_s += time.perf_counter() - wall
-        self.cpu_s += time.process_time() - cpu
 
     def _provenance(self) -> Row:
         trainer, request = self.trainer, self.plan["request"]
@@ -154,6 +166,8 @@ class Run:
             "complete": trainer.step == trainer.steps,
             "wall_minutes": round(self.wall_s / 60, 2),
             "core_minutes": round(self.cpu_s / 60, 2),
+            "ranks": ranks(),
+            "device": device_name(trainer.device),
             "keyframes_sha256": self.plan["keyframes"],
             "code_version": code_version(),
             "torch": torch.__version__,
@@ -167,7 +181,8 @@ class Run:
         row = {"kind": "train", "step": self.trainer.step, "lr": self.trainer.lr, **means}
         pace = round(self.trainer.recipe.batch / total, 2)
         timing = {"samples_per_s": pace, "cpu_s": round(self.cpu_s, 1)}
-        append_row(self.folder / METRICS, row | timing | shares)
+        if rank() == 0:
+            append_row(self.folder / METRICS, row | timing | shares)
         return means["loss"]
 
     def _log_validation(self) -> None:
@@ -217,11 +232,15 @@ def trim_metrics(path: Path, step: int) -> None:
 
 @contextmanager
 def deferred_signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of raising in the middle of a step; the second raises."""
+    """Collect Ctrl-C and SIGTERM instead of raising in the middle of a step; the second raises.
+
+    Not so under torchrun: it hands on what it gets, so a scheduler's signal can come twice, and it
+    kills whoever takes too long.
+    """
     received: list[int] = []
 
     def receive(number: int, _: FrameType | None) -> None:
-        if received:
+        if received and ranks() == 1:
             raise KeyboardInterrupt
         received.append(number)
 

@@ -9,6 +9,8 @@ import logging
 import statistics
 import sys
 import time
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from typing import Any
 import torch
 
 from baselines.checkpoint import METRICS, TEXT, TrainState
+from baselines.distributed import of_first, process_group, rank, wait_for_all
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
 from baselines.run import Run, read_rows
@@ -26,6 +29,16 @@ AFTER_STOP = "The same command with --resume goes on."
 
 CALIBRATION_STEPS = 8
 """Steps that are timed for `--minutes`; the first two, which compile, are left out."""
+
+
+def start(args: Sequence[str]) -> None:
+    """Read the command line and train, alone or as one of the processes of `torchrun`.
+
+    Raises:
+        UsageError: whatever a user can set right.
+    """
+    with process_group():
+        main(parse(args))
 
 
 def main(job: Job) -> None:
@@ -43,28 +56,37 @@ def main(job: Job) -> None:
             print(f"nothing to do: {options.folder} is complete ({state.step} steps).")
             return
     material = Material.load(job)
-    with sole_writer(options.folder):
+    wait_for_all()  # no rank may take what another begins for an earlier run
+    with sole_writer(options.folder) if rank() == 0 else nullcontext():
         run = _begin(material) if state is None else _continue(material, state)
         run.finish(validate_every=options.validate_every)
-    _report(options.folder)
+    if rank() == 0:
+        _report(options.folder)
 
 
 def _begin(material: Material) -> Run:
     """Fix the number of steps and write what does not change during the run."""
-    job, folder = material.job, material.job.options.folder
-    steps = _steps(material)
-    (folder / METRICS).unlink(missing_ok=True)
+    job, steps = material.job, _steps(material)
     job = Job(job.options, with_samples(job.config, steps * job.config.recipe.batch))
     material = replace(material, job=job, identity=replace(material.identity, config=job.config))
-    material.identity.save(folder)
-    sentences = set().union(*sentences_of(material.keyframes).values())
-    material.text.save(folder / TEXT, sentences)
+    if rank() == 0:
+        _write_down(material)
     data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
     plan = {"steps": steps, "request": _request(job), "keyframes": data}
     trainer = material.trainer(steps)
-    run = Run(trainer, folder, plan, validate=material.validator(trainer.network.sight))
+    validate = material.validator(trainer.network.sight)
+    run = Run(trainer, job.options.folder, plan, validate=validate)
     run.save()
     return run
+
+
+def _write_down(material: Material) -> None:
+    """Write what stays as it is, over whatever a run that never got this far has left."""
+    folder = material.job.options.folder
+    (folder / METRICS).unlink(missing_ok=True)
+    material.identity.save(folder)
+    sentences = set().union(*sentences_of(material.keyframes).values())
+    material.text.save(folder / TEXT, sentences)
 
 
 def _continue(material: Material, state: TrainState) -> Run:
@@ -135,7 +157,7 @@ def _steps(material: Material) -> int:
         trainer.advance()
         seconds.append(time.perf_counter() - start)
     pace = statistics.median(seconds[2:])
-    steps = max(1, round(60 * options.minutes / pace))
+    steps = of_first(max(1, round(60 * options.minutes / pace)))
     print(f"{pace:.2f} s a step: {options.minutes:g} minutes are {steps} steps.")
     return steps
 
@@ -165,4 +187,4 @@ def _score_line(name: str, scores: dict[str, Any]) -> str:
 
 if __name__ == "__main__":
     logging.basicConfig(format="%(message)s", level=logging.INFO)
-    run_command(lambda: main(parse(sys.argv[1:])), after_stop=AFTER_STOP)
+    run_command(lambda: start(sys.argv[1:]), after_stop=AFTER_STOP)

@@ -5,18 +5,26 @@ resumed ends in the same bits as an unbroken one.
 """
 
 import ctypes
+import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from baselines.agent import Network, Recipe
-from baselines.batch import Batch
+from baselines.batch import Batch, moved
+from baselines.distributed import anywhere, batch_norms, rank, ranks
 from baselines.loader import Loader
 from baselines.optim import Ema, Lamb, TensorTable, copy_into, learning_rate
 from baselines.samples import stream
 from sacil_tasks.errors import UsageError
+
+log = logging.getLogger(__name__)
+
+Loss: TypeAlias = Callable[[Batch], tuple[Tensor, dict[str, Tensor]]]
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 """Names of glibc's malloc.h."""
@@ -34,6 +42,36 @@ def keep_freed_memory() -> None:
         libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
+class _Loss(nn.Module):
+    """A network whose forward pass is its loss, which is what DDP can wrap."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.network.loss(batch)
+
+
+def shared_loss(network: Network) -> Loss:
+    """The network's loss; with several ranks its gradients are the means over them.
+
+    Losses are means over samples, or are computed of all ranks' samples on each rank
+    (`distributed.gathered`), so that is the gradient of the whole batch. Batch norm is the
+    exception: its layers are named in a warning. Gradients are shared as long as the function that
+    is returned lives.
+    """
+    if ranks() == 1:
+        return network.loss
+    if names := batch_norms(network):
+        log.warning(
+            "batch norm (%s) sees the samples of one process only: what is learnt depends on the "
+            "number of processes.",
+            ", ".join(names),
+        )
+    return DistributedDataParallel(_Loss(network))
+
+
 class Trainer:
     """A network with its loader, optimiser and weight average, at some step of its run."""
 
@@ -43,6 +81,7 @@ class Trainer:
         """Begin at step 0 of `steps`, with the weights `network` has now."""
         keep_freed_memory()
         self.network = network.train()
+        self.device = network.device
         self.recipe = recipe
         self.steps = steps
         self.step = 0
@@ -50,15 +89,16 @@ class Trainer:
         self._seed = seed
         self._optimiser = Lamb(network, weight_decay=recipe.weight_decay)
         self._ema = Ema(network, decay=recipe.ema_decay)
+        self._loss = shared_loss(network)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; returns the loss, its terms, and the seconds its parts took.
+        """Take one step; returns this rank's loss and terms, and the seconds its parts took.
 
         Raises:
-            UsageError: the loss is not finite; the weights are left as they were.
+            UsageError: the loss is not finite on some rank; the weights are left as they were.
         """
         start = time.perf_counter()
-        batch = self._loader.batch(self.step)
+        batch = moved(self._loader.batch(self.step), self.device)
         loaded = time.perf_counter()
         terms = self.learn(batch)
         learnt = time.perf_counter()
@@ -82,14 +122,15 @@ class Trainer:
         """Forward and backward; returns the loss and its terms.
 
         Raises:
-            UsageError: the loss is not finite.
+            UsageError: the loss is not finite on some rank.
         """
         # Dropout draws from torch's global generator: fix it by step, or a resumed run differs.
-        torch.manual_seed(int(stream(self._seed, self.step, "torch").integers(2**63)))
+        torch.manual_seed(int(stream(self._seed, self.step, "torch").integers(2**63)) + rank())
         # D-precision: bfloat16 in the `cpu` preset.
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.precision == "bf16"):
-            loss, terms = self.network.loss(batch)
-        if not torch.isfinite(loss):
+        rough = self.recipe.precision == "bf16"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=rough):
+            loss, terms = self._loss(batch)
+        if anywhere(not torch.isfinite(loss)):
             raise self._diverged("the loss")
         loss.backward()
         return {name: float(term) for name, term in ({"loss": loss.detach()} | terms).items()}

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from baselines import checkpoint
 from baselines.agent import Network
+from baselines.batch import moved
 from baselines.checkpoint import find_released
 from baselines.loader import Loader
 from baselines.rotation import multiply
@@ -155,7 +156,7 @@ def _tally(scores: Sequence[Score]) -> tuple[int, int]:
 @torch.no_grad()
 def _score_batch(network: Network, loader: Loader, samples: list[Sample]) -> Iterator[Score]:
     batch = loader.plain(samples)
-    chosen = network.act(batch.inputs)
+    chosen = moved(network.act(moved(batch.inputs, network.device)), torch.device("cpu"))
     right = chosen.gripper_open.long() == batch.labels.gripper_open
     for i, sample in enumerate(samples):
         shard = loader.keyframes.shards[sample.shard]

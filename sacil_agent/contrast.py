@@ -4,6 +4,9 @@ Both pull matched rows of two feature sets together and push the other rows of t
 symmetric InfoNCE, minimised (D-equations: the printed ones lack a minus sign). Rows that mean the
 same are no negatives (D-mask): with a handful of sizes a batch is full of samples that ask for the
 same thing in other words, and the paper takes negatives from other trajectories only.
+
+Where several processes share a batch, each computes the contrasts of all its rows (`n`, of which
+its own are `b`).
 """
 
 import math
@@ -14,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.batch import Batch
+from baselines.distributed import gathered
 from baselines.layers.attention import linear
 
 FIRST_TEMPERATURE = 0.07
@@ -37,10 +41,11 @@ class Contrast(nn.Module):
         self,
         ours: Float[Tensor, "b d"],
         theirs: Float[Tensor, "b e"],
-        same: Bool[Tensor, "b b"],
-    ) -> tuple[Tensor, Float[Tensor, "b b"]]:
+        same: Bool[Tensor, "n n"],
+    ) -> tuple[Tensor, Float[Tensor, "n n"]]:
         """Loss, and the cosine of each pair, ours along the rows."""
-        cosines = cosine_matrix(self.ours(ours), self.theirs(theirs))
+        mine, yours = self.ours(ours).float(), self.theirs(theirs).float()
+        cosines = cosine_matrix(gathered(mine), gathered(yours))
         scale = self.log_scale.clamp(max=math.log(MAX_SCALE)).exp()
         return info_nce(scale * cosines, same), cosines.detach()
 
@@ -61,9 +66,9 @@ def cosine_matrix(ours: Float[Tensor, "b d"], theirs: Float[Tensor, "b d"]) -> F
         return ours @ theirs.T
 
 
-def same_meaning(batch: Batch) -> Bool[Tensor, "b b"]:
+def same_meaning(batch: Batch) -> Bool[Tensor, "n n"]:
     """Pairs that are no negatives of each other: equal task and slots, or one trajectory."""
-    meaning, trajectory = batch.meaning, batch.trajectory
+    meaning, trajectory = gathered(batch.meaning), gathered(batch.trajectory)
     return (meaning[:, None] == meaning) | (trajectory[:, None] == trajectory)
 
 
@@ -78,20 +83,21 @@ def size_candidates(task: Int64[Tensor, "b"], meaning: Int64[Tensor, "b"]) -> Bo
     return (task[:, None] == task) & stands_for_other | (index[:, None] == index)
 
 
-def diagnostics(name: str, cosines: Float[Tensor, "b b"], batch: Batch) -> dict[str, Tensor]:
+def diagnostics(name: str, cosines: Float[Tensor, "n n"], batch: Batch) -> dict[str, Tensor]:
     """How often the match wins among same-task candidates, beside its chance level.
 
     First and later keyframes apart: before the first one the scene shows every size and nothing
     tells which is meant, so accuracy there should stay near chance unless something leaks.
     Groups without a choice are NaN, which the training log leaves out.
     """
-    candidates = size_candidates(batch.task, batch.meaning)
+    candidates = size_candidates(gathered(batch.task), gathered(batch.meaning))
+    first = gathered(batch.first)
     chosen = cosines.masked_fill(~candidates, -torch.inf).argmax(dim=1)
     hit = (chosen == torch.arange(len(chosen), device=chosen.device)).float()
     chance = 1 / candidates.sum(dim=1)
     open_choice = chance < 1
     found = {}
-    for group, rows in (("first", batch.first), ("later", ~batch.first)):
+    for group, rows in (("first", first), ("later", ~first)):
         counted = rows & open_choice
         found[f"{name}/accuracy_{group}"] = hit[counted].mean()
         found[f"{name}/chance_{group}"] = chance[counted].mean()

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Sequence
 
 from baselines import train
-from baselines.options import parse
 from sacil_tasks.errors import run_command
 
 DEFAULT = ("--agent", "sacil")
@@ -19,4 +18,4 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 if __name__ == "__main__":
     logging.basicConfig(format="%(message)s", level=logging.INFO)
-    run_command(lambda: train.main(parse(arguments(sys.argv[1:]))), after_stop=train.AFTER_STOP)
+    run_command(lambda: train.start(arguments(sys.argv[1:])), after_stop=train.AFTER_STOP)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import observation
 from torch import Tensor
 
-from baselines.agent import Network
+from baselines.agent import Network, agent_modules, find_agent
 from baselines.batch import Batch, Inputs, Labels
 from baselines.loader import inputs_of
 from baselines.rotation import canonical_yaw, quaternion_to_bins
@@ -43,6 +43,15 @@ TINY: dict[str, Any] = {
     "dropout": 0.0,
 }
 """Sizes by field name; a config takes those it has."""
+
+
+def registered() -> list[str]:
+    """Every agent and every `agent:variant`."""
+    names = []
+    for agent in sorted(agent_modules()):
+        spec, _ = find_agent(agent)
+        names += [agent, *(f"{agent}:{variant}" for variant in spec.variants)]
+    return names
 
 
 def tiny(config: Any) -> Any:
@@ -118,9 +127,14 @@ def _painted(rng: np.random.Generator) -> tuple[Moment, np.ndarray]:
 
 def row(part: Any, index: int) -> Any:
     """One sample of a dataclass of tensors, as a batch of one."""
+    return rows(part, slice(index, index + 1))
+
+
+def rows(part: Any, which: slice) -> Any:
+    """Some samples of a dataclass of tensors."""
     if is_dataclass(part):
-        return replace(part, **{name: row(value, index) for name, value in vars(part).items()})
-    return part[index : index + 1]
+        return replace(part, **{name: rows(value, which) for name, value in vars(part).items()})
+    return None if part is None else part[which]
 
 
 def changed(inputs: Inputs, **values: Tensor) -> Inputs:

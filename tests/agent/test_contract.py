@@ -6,23 +6,14 @@ from typing import Any
 
 import pytest
 import torch
-from networks import TEXT, blank_moments, make_batch, make_inputs, row, tiny
+from networks import TEXT, blank_moments, make_batch, make_inputs, registered, row, tiny
 
 from baselines import checkpoint
-from baselines.agent import Network, agent_modules, find_agent
+from baselines.agent import Network, find_agent
 from baselines.batch import Batch, Prediction
 from baselines.checkpoint import Identity
 from baselines.optim import Lamb
 from baselines.text import SentenceTable
-
-
-def registered() -> list[str]:
-    """Every agent and every `agent:variant`."""
-    names = []
-    for agent in sorted(agent_modules()):
-        spec, _ = find_agent(agent)
-        names += [agent, *(f"{agent}:{variant}" for variant in spec.variants)]
-    return names
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,6 @@
 """Tiny keyframe files in the real schema, and a tiny agent: what the trainer's tests run on."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +103,7 @@ class TinyConfig:
 
     pixels: int = 16
     goals: bool = False
+    dropout: float = 0.3
     recipe: Recipe = field(default_factory=lambda: Recipe(batch=4, samples=48, warmup_steps=2))
 
 
@@ -113,7 +114,7 @@ class Tiny(Network):
         super().__init__()
         self.sight = ViewSight(config.pixels)
         self.needs_goals = config.goals
-        self.dropout = nn.Dropout(0.3)
+        self.dropout = nn.Dropout(config.dropout)
         self.position = nn.Linear(5 * 7 + 2 + text.dim, 3)
 
     def forward(self, inputs: Inputs) -> torch.Tensor:
@@ -137,6 +138,6 @@ class Tiny(Network):
 AGENT = AgentSpec(
     name="tiny",
     presets={"cpu": TinyConfig(), "paper": TinyConfig(pixels=24)},
-    variants={"goals": lambda config: TinyConfig(goals=True, recipe=config.recipe)},
+    variants={"goals": lambda config: replace(config, goals=True)},
     create=Tiny,
 )
