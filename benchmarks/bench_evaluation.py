@@ -1,10 +1,11 @@
 """Where the time of an evaluated episode goes, and what a second worker adds.
 
     python benchmarks/bench_evaluation.py --agent rvt [--tasks pick_and_lift ...] [--rounds 3]
+    python benchmarks/bench_evaluation.py --records results/test/rvt/episodes.jsonl
 
-Plays the same episodes of `val` with one worker and with two, by turns. The split is that of one
-worker: `setup` builds the scene and has the expert plan it, `rest` is the harness itself. Nothing
-is kept.
+Plays the same episodes of `val` with one worker and with two, by turns, and keeps nothing. The
+split is that of one worker: `setup` builds the scene and has the expert plan it, `rest` is the
+harness itself. With `--records` nothing is played: the split is that of episodes played before.
 """
 
 import tempfile
@@ -42,6 +43,9 @@ class BenchConfig:
     rounds: int = 1
     """With one worker, and with two."""
 
+    records: Path | None = None
+    """File of episodes whose seconds to split instead."""
+
 
 @dataclass(frozen=True)
 class Round:
@@ -56,21 +60,28 @@ class Round:
 
 def main(config: BenchConfig) -> None:
     """Time and print."""
+    if config.records is not None:
+        print_split(read_records(config.records))
+        return
     pairs = [(play(config, 1), play(config, 2)) for _ in range(config.rounds)]
     alone, together = zip(*pairs, strict=True)
-    records = [record for played in alone for record in played.records]
-    print(f"\n{'':<30}" + "".join(f"{name:>11}" for name in (*PHASES, "rest", "total")))
-    for task in config.tasks:
-        spent = [record.seconds for record in records if record.task == task]
-        print(f"{task:<18}{'median ms':<12}{medians(spent)}")
-        print(f"{'':<18}{'share':<12}{shares(spent)}")
-    keyframes = sum(record.keyframes for record in records)
-    inference = sum(record.seconds.inference for record in records)
-    print(f"inference per keyframe: {1000 * inference / max(keyframes, 1):.1f} ms")
+    print_split([record for played in alone for record in played.records])
     print("episodes a second       one worker  two workers")
     for name, speed in (("while they play", playing), ("with the start", whole)):
         one, two = median(map(speed, alone)), median(map(speed, together))
         print(f"{name:<22}{one:>12.2f}{two:>13.2f}{two / one:>8.2f}x")
+
+
+def print_split(records: Sequence[EpisodeRecord]) -> None:
+    """Two lines a task: milliseconds and shares."""
+    print(f"\n{'':<30}" + "".join(f"{name:>11}" for name in (*PHASES, "rest", "total")))
+    for task in dict.fromkeys(record.task for record in records):
+        spent = [record.seconds for record in records if record.task == task]
+        print(f"{task:<20}{'median ms':<10}{medians(spent)}")
+        print(f"{'':<20}{'share':<10}{shares(spent)}")
+    keyframes = sum(record.keyframes for record in records)
+    inference = sum(record.seconds.inference for record in records)
+    print(f"inference per keyframe: {1000 * inference / max(keyframes, 1):.1f} ms")
 
 
 def play(config: BenchConfig, workers: int) -> Round:
