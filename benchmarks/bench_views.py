@@ -2,7 +2,8 @@
 
 One cloud comes from four synthetic depth cameras around a table with boxes, so that points are
 ordered and overlap as in real observations; the other is the worst case. Views and decoding are
-checked against plain torch versions of the same result, which are also timed.
+checked against plain versions of the same result, which are also timed: views in torch, by
+scattering the nearest depth, and in numpy, by drawing all points from the farthest to the nearest.
 """
 
 import functools
@@ -108,6 +109,39 @@ def _torch_view(
     return torch.cat([colours, torch.where(seen, relative, views.EMPTY_DEPTH)[None]])
 
 
+def numpy_views(
+    xyz: Float32[np.ndarray, "n 3"],
+    rgb: np.ndarray,
+    transform: np.ndarray,
+    pixels: int,
+    chosen: tuple[views.View, ...],
+) -> Float32[np.ndarray, "v 7 h w"]:
+    """The same picture in numpy: points are sorted by depth and the nearest is drawn last."""
+    placed = np.stack([sum(r[i] * xyz[:, i] for i in range(3)) + r[3] for r in transform], axis=-1)
+    kept = (np.abs(placed) <= 1).all(axis=-1)
+    placed = placed[kept]
+    features = np.concatenate([placed, rgb[kept] / np.float32(255)], axis=-1)
+    cells = (np.float32(pixels / 2) * (1 + placed) + np.float32(0.5)).astype(np.int64)
+    return np.stack([_numpy_view(features, cells, view, pixels) for view in chosen])
+
+
+def _numpy_view(
+    features: Float32[np.ndarray, "n 6"], cells: np.ndarray, view: views.View, pixels: int
+) -> Float32[np.ndarray, "7 h w"]:
+    depth = 1 - view.side * features[:, view.depth_axis]
+    order = np.argsort(depth, kind="stable")[::-1]  # of equal ones the first is drawn last
+    side = pixels + 2
+    first = (cells[:, view.v_axis] * side + cells[:, view.u_axis])[order]
+    winner = np.full(side * side, -1)
+    corners = first[:, None] + np.array([0, 1, side, side + 1])
+    winner[corners.ravel()] = np.repeat(order, 4)
+    winner = winner.reshape(side, side)[1:-1, 1:-1][::-1, :: view.u_sign]
+    seen = winner >= 0
+    relative = depth[winner] - depth[winner][seen].mean(dtype=np.float64).astype(np.float32)
+    colours = features[winner].transpose(2, 0, 1) * seen
+    return np.concatenate([colours, np.where(seen, relative, views.EMPTY_DEPTH)[None]])
+
+
 def torch_best_cell(logits: Float[torch.Tensor, "1 5 h w"]) -> int:
     """Arg-max over the whole grid with every score in memory."""
     xy, xz, yz = (plane[0] for plane in heatmap.score_planes(logits))
@@ -127,11 +161,11 @@ def median_ms(call: Callable[[], object], rounds: int = 41) -> float:
     return statistics.median(times[2:])
 
 
-def report(label: str, fast: Callable[[], object], slow: Callable[[], object] | None) -> None:
-    """Print one row: time, and how many times longer the torch version takes."""
+def report(label: str, fast: Callable[[], object], *slow: Callable[[], object]) -> None:
+    """Print one row: time, and how many times longer each plain version takes."""
     took = median_ms(fast)
-    ratio = "" if slow is None else f"{median_ms(slow, rounds=7) / took:8.1f}x"
-    print(f"  {label:38}{took:9.3f}{ratio}", flush=True)
+    ratios = "".join(f"{median_ms(call, rounds=7) / took:8.1f}x" for call in slow)
+    print(f"  {label:38}{took:9.3f}{ratios}", flush=True)
 
 
 def time_views(
@@ -143,23 +177,22 @@ def time_views(
     views.render_views(xyz, rgb, transform, pixels, out, chosen)
     expected = torch_views(xyz, rgb, transform, pixels, chosen)
     different = int((torch.from_numpy(out) != expected).sum())
+    others = int((out != numpy_views(xyz, rgb, transform, pixels, chosen)).sum())
     covered = np.mean(out[:, 6] != views.EMPTY_DEPTH)
-    print(
-        f"{label}: {len(xyz)} points, {covered:.0%} covered, {different} values differ from torch"
-    )
+    print(f"{label}: {len(xyz)} points, {covered:.0%} covered")
+    print(f"  values that differ from torch: {different}, from numpy: {others}")
     report(
         f"{len(chosen)} views of {pixels} px",
         lambda: views.render_views(xyz, rgb, transform, pixels, out, chosen),
         lambda: torch_views(xyz, rgb, transform, pixels, chosen),
+        lambda: numpy_views(xyz, rgb, transform, pixels, chosen),
     )
 
 
 def time_heatmaps(pixels: int) -> None:
     """Time targets and decoding; the best cell is compared with the whole grid in memory."""
     points = 2 * torch.rand(16, 3) - 1
-    report(
-        f"16 target heatmaps, {pixels} px", lambda: heatmap.target_heatmaps(points, pixels), None
-    )
+    report(f"16 target heatmaps, {pixels} px", lambda: heatmap.target_heatmaps(points, pixels))
     peaked = (heatmap.target_heatmaps(points[:1], pixels) + 1e-6).log()
     noise = torch.randn(1, 5, pixels, pixels)
     for label, logits in (("peaked", peaked), ("noise", noise)):
@@ -183,11 +216,11 @@ def main() -> None:
     """Time and check everything once."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
-    print(f"  {'one core':38}ms (median)   torch")
+    print(f"  {'one core':38}ms (median)   torch    numpy")
     sensors, rng = observe(), np.random.default_rng(0)
     scene = cloud.unproject(*sensors)
-    report("cloud from 4 images of 128 x 128 px", lambda: cloud.unproject(*sensors), None)
-    report("draw an augmentation", lambda: draw_matrix(rng), None)
+    report("cloud from 4 images of 128 x 128 px", lambda: cloud.unproject(*sensors))
+    report("draw an augmentation", lambda: draw_matrix(rng))
     center, half = np.array(SCENE_BOUNDS.center_in_base), SCENE_BOUNDS.side_m / 2
     uniform = (center + rng.uniform(-half, half, (POINTS, 3))).astype(np.float32)
     colours = rng.integers(0, 256, uniform.shape, dtype=np.uint8)

@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from baselines.layers.tiles import attend_with_loss
+
 LEAK = 0.02
 """Negative slope of every LeakyReLU in RVT's convolutions and projections."""
 
@@ -47,6 +49,8 @@ def attend(
         scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
         weights = (scores if bias is None else scores + bias.to(q.dtype)).softmax(-1)
         return functional.dropout(weights, dropout, training=dropout > 0) @ v
+    if q.device.type == "cpu" and dropout > 0:
+        return attend_with_loss(q, k, v, bias=bias, dropout=dropout)
     mask = None if bias is None else bias.to(q.dtype)
     return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
 

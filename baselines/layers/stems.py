@@ -7,9 +7,11 @@ Two pairs with this interface, n being batch x views: RVT's own, one patch convo
 full-resolution skip, and a strided pyramid of convolutions that a CPU can train.
 """
 
+from functools import cache
 from typing import Literal, TypeAlias
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -50,6 +52,57 @@ def convolution(
     return layer
 
 
+def side_by_side(layer: nn.Conv2d, *maps: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n c h w"]:
+    """`layer`, which keeps a map's size and replicates its edge, over maps side by side.
+
+    Each map meets its own part of the weights: joined first they would take half as long again,
+    most of it on the way back through slices of the gradient.
+    """
+    parts = layer.weight.split([x.shape[1] for x in maps], dim=1)
+    edge = layer.kernel_size[0] // 2
+    if edge:  # padding by nothing would still copy
+        maps = tuple(functional.pad(x, (edge,) * 4, mode="replicate") for x in maps)
+    out = functional.conv2d(maps[0], parts[0], layer.bias)
+    for x, part in zip(maps[1:], parts[1:], strict=True):
+        out = out + functional.conv2d(x, part)
+    return out
+
+
+@cache
+def bilinear_taps(kernel: int, scale: int) -> Float[Tensor, "{scale} {kernel} cells"]:
+    """For each pixel of a cell and each tap of a kernel about it, the shares of the cells around in
+    what bilinear up-sampling by `scale` puts under the tap, along one axis."""
+    pixel, tap = torch.meshgrid(torch.arange(scale), torch.arange(kernel), indexing="ij")
+    place = (pixel + tap - kernel // 2 + 0.5) / scale - 0.5  # in cells from the pixel's own
+    reach = int(place.abs().max().ceil())
+    cells = torch.arange(-reach, reach + 1)
+    return (1 - (place[..., None] - cells).abs()).clamp(min=0)
+
+
+def conv_of_upsampled(
+    x: Float[Tensor, "n c y x"], layer: nn.Conv2d, scale: int
+) -> Float[Tensor, "n e h w"]:
+    """`layer`, an odd kernel with replicated edges, over `x` up-sampled bilinearly by `scale`.
+
+    The larger map is never made. All pixels at the same place in their cells see the same mix of
+    the cells around, so this is a convolution of `x` with as many outputs as a cell has pixels,
+    3 x 3 where the kernel is no larger than a cell: RVT's 11 x 11 takes 9 products instead of 121.
+    Replicating the edge before or after bilinear up-sampling is the same.
+    """
+    taps = bilinear_taps(layer.kernel_size[0], scale).to(x.device)
+    with torch.autocast(x.device.type, enabled=False):
+        across = torch.einsum("e c u v, q v j -> e c u q j", layer.weight, taps)
+        weight = torch.einsum("e c u q j, p u i -> p q e c i j", across, taps).flatten(0, 2)
+    bias = None if layer.bias is None else layer.bias.repeat(scale**2)
+    edge = taps.shape[-1] // 2
+    padded = functional.pad(x, (edge,) * 4, mode="replicate")
+    padded = padded.contiguous(memory_format=torch.channels_last)
+    cells = functional.conv2d(padded, weight, bias)
+    # Channels stay last in memory.
+    full = rearrange(cells, "n (p q e) y x -> n (y p) (x q) e", p=scale, q=scale)
+    return full.permute(0, 3, 1, 2)
+
+
 def separable(fan_in: int, fan_out: int) -> nn.Sequential:
     """A 3x3 convolution of each channel alone, then a 1x1: a third of the time of a full 3x3."""
     alone = nn.Conv2d(fan_in, fan_in, 3, padding=1, groups=fan_in)
@@ -72,7 +125,8 @@ class PatchStem(nn.Module):
 
     def forward(self, images: Float[Tensor, "n 10 h w"]) -> tuple[Float[Tensor, "n c g g"], Maps]:
         """Token map, and the full-resolution map as the only skip."""
-        skip = leaky(self.pixelwise(images))
+        # Channels last: 2 to 4 times faster on a CPU, forwards and backwards.
+        skip = leaky(self.pixelwise(images.contiguous(memory_format=torch.channels_last)))
         return leaky(self.norm(self.patches(skip))), [skip]
 
 
@@ -95,10 +149,8 @@ class PatchDecoder(nn.Module):
     ) -> tuple[Float[Tensor, "n 1 h w"], Maps]:
         """Heatmap logits and the map they are read from."""
         coarse = leaky(self.coarse(tokens))
-        full = functional.interpolate(
-            coarse, scale_factor=self.patch, mode="bilinear", align_corners=False
-        )
-        merged = leaky(self.merge(torch.cat([leaky(self.fine(full)), skips[0]], dim=1)))
+        fine = leaky(conv_of_upsampled(coarse, self.fine, self.patch))
+        merged = leaky(side_by_side(self.merge, fine, skips[0]))
         return self.heat(merged), [merged]
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.layers.stems import convolution, leaky
+from baselines.layers.stems import convolution, leaky, side_by_side
 
 IMAGE_CHANNELS = 4
 """Red, green, blue and where the gripper is."""
@@ -85,30 +85,18 @@ def replicated(fan_in: int, fan_out: int, kernel: int = 3, *, stride: int = 1) -
 
 
 class Merge(nn.Module):
-    """A convolution over a coarse map and a skip side by side, with the skip's channels out.
-
-    Each map meets its own part of the weights: joined first they would take half as long again,
-    most of it on the way back through slices of the gradient.
-    """
+    """A convolution over a coarse map and a skip side by side, with the skip's channels out."""
 
     def __init__(self, coarse: int, skip: int, kernel: int) -> None:
         """Channels of both maps."""
         super().__init__()
-        self.split, self.edge = coarse, kernel // 2
         self.layer = replicated(coarse + skip, skip, kernel)
 
     def forward(
         self, coarse: Float[Tensor, "n a h w"], skip: Float[Tensor, "n b h w"]
     ) -> Float[Tensor, "n b h w"]:
         """What `layer` makes of both."""
-        first, second = self.layer.weight.split((self.split, skip.shape[1]), dim=1)
-        merged = functional.conv2d(self._edged(coarse), first, self.layer.bias)
-        return merged + functional.conv2d(self._edged(skip), second)
-
-    def _edged(self, x: Float[Tensor, "n c y x"]) -> Float[Tensor, "n c h w"]:
-        if not self.edge:
-            return x  # padding by nothing would still copy
-        return functional.pad(x, (self.edge,) * 4, mode="replicate")
+        return side_by_side(self.layer, coarse, skip)
 
 
 def doubled(x: Float[Tensor, "n c y x"]) -> Float[Tensor, "n c h w"]:

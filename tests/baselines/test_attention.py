@@ -15,6 +15,9 @@ from baselines.layers.stems import (
     PatchStem,
     PyramidDecoder,
     PyramidStem,
+    conv_of_upsampled,
+    convolution,
+    side_by_side,
     with_locations,
 )
 from baselines.rotation import bins_to_quaternion
@@ -185,3 +188,26 @@ def test_the_head_keeps_views_apart_and_samples_whole() -> None:
     alone = head(tokens[5:], heat[5:], [maps[0][5:]])
     torch.testing.assert_close(both.rotation[1:], alone.rotation)
     assert torch.equal(both.heatmaps[1], heat[5:, 0])
+
+
+@pytest.mark.parametrize(("kernel", "scale"), [(11, 11), (5, 16), (3, 2), (7, 3), (1, 4)])
+def test_convolution_of_an_upsampled_map_needs_no_upsampled_map(kernel: int, scale: int) -> None:
+    torch.manual_seed(0)
+    x = torch.randn(2, 6, 4, 5, requires_grad=True)
+    layer = convolution(6, 3, kernel, padding_mode="replicate")
+    larger = functional.interpolate(x, scale_factor=scale, mode="bilinear")
+    both = conv_of_upsampled(x, layer, scale), layer(larger)
+    torch.testing.assert_close(*both, rtol=0, atol=1e-5)
+    direction = torch.randn_like(both[0]) / scale
+    wanted = (x, layer.weight, layer.bias)
+    ours, theirs = (torch.autograd.grad(out, wanted, direction) for out in both)
+    for found, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_maps_side_by_side_meet_the_weights_of_the_joined_map() -> None:
+    torch.manual_seed(0)
+    maps = torch.randn(2, 5, 6, 7), torch.randn(2, 3, 6, 7)
+    layer = convolution(8, 4, 3, padding_mode="replicate")
+    found, expected = side_by_side(layer, *maps), layer(torch.cat(maps, dim=1))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)

@@ -1,0 +1,67 @@
+"""Attention tile by tile against whole matrices of scores."""
+
+import pytest
+import torch
+
+from baselines.layers import tiles
+from baselines.layers.attention import padding_bias
+
+DROPOUT = 0.25
+
+
+def made(queries: int = 7, keys: int = 9) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(2, 3, count, 4) for count in (queries, keys, keys)]
+    return [torch.randn(s, generator=generator).double().requires_grad_() for s in shapes]
+
+
+def bias() -> torch.Tensor:
+    return padding_bias(torch.arange(9) < torch.tensor([[9], [5]]))
+
+
+def whole(
+    q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, generator: torch.Generator
+) -> torch.Tensor:
+    """The same with every score in memory."""
+    weights = (q @ k.mT / q.shape[-1] ** 0.5 + bias().double()).softmax(-1)
+    return weights * tiles.kept(weights, DROPOUT, generator) / (1 - DROPOUT) @ v
+
+
+def test_values_and_gradients_are_those_of_whole_matrices() -> None:
+    inputs = made()
+    torch.manual_seed(1)
+    found = tiles.attend_with_loss(*inputs, bias=bias(), dropout=DROPOUT)
+    torch.manual_seed(1)
+    generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())))
+    expected = whole(*inputs, generator)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    direction = torch.randn_like(found)
+    pairs = [torch.autograd.grad(out, inputs, direction) for out in (found, expected)]
+    for ours, theirs in zip(*pairs, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tile", [1, 9, 20, 63, 130])
+def test_gradients_are_right_for_any_tile(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "TILE", tile)
+
+    def attend(*inputs: torch.Tensor) -> torch.Tensor:
+        torch.manual_seed(2)
+        return tiles.attend_with_loss(*inputs, bias=bias(), dropout=DROPOUT)
+
+    assert torch.autograd.gradcheck(attend, made(), fast_mode=True)
+
+
+@pytest.mark.parametrize("dropout", [0.1, 0.5])
+def test_as_many_are_lost_as_asked_for(dropout: float) -> None:
+    gone = 1 - tiles.kept(torch.empty(1000, 997), dropout, torch.Generator().manual_seed(0))
+    rows = gone.mean(1)
+    assert gone.mean() == pytest.approx(dropout, abs=2e-3)
+    assert rows.std() == pytest.approx((dropout * (1 - dropout) / 997) ** 0.5, rel=0.1)
+
+
+def test_without_loss_it_is_attention() -> None:
+    inputs = made()
+    found = tiles.attend_with_loss(*inputs, bias=None, dropout=0.0)
+    expected = torch.nn.functional.scaled_dot_product_attention(*inputs)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
