@@ -4,7 +4,7 @@ Positions are in cube coordinates ([-1, 1] on each axis spans `interface.SCENE_B
 """
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -87,13 +87,15 @@ class Prediction:
 
 def moved(part: P, device: torch.device) -> P:
     """A dataclass of tensors, nested ones too, on `device`; what is no tensor stays."""
-    part_or_any: Any = part
-    if isinstance(part_or_any, Tensor):
-        return part_or_any.to(device)
-    if is_dataclass(part_or_any):
-        names = [field.name for field in fields(part_or_any)]
-        return replace(part_or_any, **{n: moved(getattr(part_or_any, n), device) for n in names})
-    return part
+    return cast(P, _moved(part, device))
+
+
+def _moved(part: Any, device: torch.device) -> Any:
+    if isinstance(part, Tensor):
+        return part.to(device)
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    return replace(part, **{f.name: _moved(getattr(part, f.name), device) for f in fields(part)})
 
 
 def proprio(*, gripper_open: bool, step: int, max_steps: int) -> tuple[float, float]:

@@ -67,7 +67,7 @@ class _Attention(torch.autograd.Function):
     ) -> Tensor:
         generator = torch.Generator().manual_seed(seed)
         out = q.new_empty(*q.shape[:2], v.shape[-1])
-        for n, rows in _tiles(*q.shape[:2], k.shape[1]):
+        for n, rows in _tiles(q.shape[0], q.shape[1], k.shape[1]):
             weights = (q[n, rows] @ k[n].mT).add_(bias[n]).softmax(-1)
             weights.mul_(kept(weights, dropout, generator))
             out[n, rows] = (weights @ v[n]).div_(1 - dropout)
@@ -82,7 +82,7 @@ class _Attention(torch.autograd.Function):
         share = (gradients[0] * out).sum(-1, keepdim=True)
         gradient = gradients[0] / (1 - ctx.dropout)
         to_q, to_k, to_v = torch.empty_like(q), torch.zeros_like(k), torch.zeros_like(v)
-        for n, rows in _tiles(*q.shape[:2], k.shape[1]):
+        for n, rows in _tiles(q.shape[0], q.shape[1], k.shape[1]):
             weights = (q[n, rows] @ k[n].mT).add_(bias[n]).softmax(-1)
             stays = kept(weights, ctx.dropout, generator)
             to_weights = (gradient[n, rows] @ v[n].mT).mul_(stays)
