@@ -87,13 +87,13 @@ class Prediction:
 
 def moved(part: P, device: torch.device) -> P:
     """A dataclass of tensors, nested ones too, on `device`; what is no tensor stays."""
-    part_or_any: Any = part
-    if isinstance(part_or_any, Tensor):
-        return part_or_any.to(device)
-    if is_dataclass(part_or_any):
-        names = [field.name for field in fields(part_or_any)]
-        return replace(part_or_any, **{n: moved(getattr(part_or_any, n), device) for n in names})
-    return part
+    found: Any = part
+    if isinstance(part, Tensor):
+        found = part.to(device)
+    elif is_dataclass(part) and not isinstance(part, type):
+        there = {field.name: moved(getattr(part, field.name), device) for field in fields(part)}
+        found = replace(part, **there)
+    return found
 
 
 def proprio(*, gripper_open: bool, step: int, max_steps: int) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 from jaxtyping import Shaped
 from torch import Tensor, distributed, nn
+from torch.distributed.rendezvous import rendezvous
 
 from sacil_tasks.errors import UsageError
 
@@ -50,7 +51,7 @@ def process_group() -> Iterator[None]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
         return
-    store, number, size = next(distributed.rendezvous("env://"))
+    store, number, size = next(rendezvous("env://"))
     # Numbers to agree on are in host memory, so they travel by gloo also between GPUs.
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(
@@ -68,7 +69,7 @@ def process_group() -> Iterator[None]:
     distributed.destroy_process_group()
 
 
-def _ends_first(store: distributed.Store, number: int) -> bool:
+def _ends_first(store: Any, number: int) -> bool:
     """Whether no rank has ended before this one."""
     try:
         return store.compare_set("ended", "", str(number)) == str(number).encode()
