@@ -4,7 +4,7 @@ Positions are in cube coordinates ([-1, 1] on each axis spans `interface.SCENE_B
 """
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -87,15 +87,13 @@ class Prediction:
 
 def moved(part: P, device: torch.device) -> P:
     """A dataclass of tensors, nested ones too, on `device`; what is no tensor stays."""
-    return cast(P, _moved(part, device))
-
-
-def _moved(part: Any, device: torch.device) -> Any:
+    found: Any = part
     if isinstance(part, Tensor):
-        return part.to(device)
-    if not is_dataclass(part) or isinstance(part, type):
-        return part
-    return replace(part, **{f.name: _moved(getattr(part, f.name), device) for f in fields(part)})
+        found = part.to(device)
+    elif is_dataclass(part) and not isinstance(part, type):
+        there = {field.name: moved(getattr(part, field.name), device) for field in fields(part)}
+        found = replace(part, **there)
+    return found
 
 
 def proprio(*, gripper_open: bool, step: int, max_steps: int) -> tuple[float, float]:

@@ -141,9 +141,10 @@ class Run:
                     if done or stopped or time.monotonic() - saved > SAVE_EVERY_S:
                         self.save()
                         saved = time.monotonic()
+            if not done:
+                log.info("saved step %d of %d in %s", trainer.step, trainer.steps, self.folder)
             wait_for_all()  # torchrun ends all ranks as soon as one leaves a stopped run
-        if stopped and not done:
-            log.info("saved step %d of %d in %s", trainer.step, trainer.steps, self.folder)
+        if not done:
             raise KeyboardInterrupt
 
     def _advance(self) -> None:

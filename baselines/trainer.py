@@ -7,6 +7,7 @@ resumed ends in the same bits as an unbroken one.
 import ctypes
 import logging
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
@@ -69,6 +70,8 @@ def shared_loss(network: Network) -> Loss:
             "number of processes.",
             ", ".join(names),
         )
+    # Channels last, a 1x1 convolution has strides of two kinds that mean the same.
+    warnings.filterwarnings("ignore", "Grad strides do not match bucket view strides")
     return DistributedDataParallel(_Loss(network))
 
 
