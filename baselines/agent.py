@@ -113,8 +113,8 @@ class Network(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
-        return next(self.parameters()).device
+        """Where it computes; without weights on the CPU."""
+        return next((weight.device for weight in self.parameters()), torch.device("cpu"))
 
     def load_pretrained(self) -> None:
         """Read weights made elsewhere, if there are any; called when a training run begins.
