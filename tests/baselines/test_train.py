@@ -140,7 +140,7 @@ def test_kill_9_in_a_real_process_loses_nothing(data, tmp_path, unbroken):
     )
     out = tmp_path / "run"
     args = command(data, out, "--steps", "12", "--validate-every", "4")
-    environment = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parents[1]}"}
+    environment = os.environ | {"PYTHONPATH": f"{here.parent}{os.pathsep}{here.parents[1]}"}
 
     def start(*flags):
         return subprocess.Popen([sys.executable, "-c", script, *args, *flags], env=environment)
