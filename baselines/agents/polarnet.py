@@ -24,7 +24,7 @@ from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
-from baselines.layers.regression import POSE, UNTURNED, Regressed
+from baselines.layers.regression import POSE, UNTURNED, Regressed, tool_axes
 from baselines.policy import KeyframePolicy, load_policy
 from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
 from baselines.text import TextSpec
@@ -268,7 +268,7 @@ class Bottleneck(nn.Module):
         return x
 
     def _gripper(self, inputs: Inputs) -> Float[Tensor, "b d"]:
-        """The current pose, which PolarNet calls the previous action."""
+        """The current pose (D-polarnet-pose), which PolarNet calls the previous action."""
         pose = inputs.gripper_in_cube
         codes = self.position(pose[:, :3]) + self.turn(tool_axes(pose[:, 3:]))
         return self.norm(codes + self.open(inputs.proprio[:, 0].long()))
@@ -292,16 +292,6 @@ def step_code(step: Tensor, width: int) -> Float[Tensor, "b d"]:
     rates = torch.exp(torch.arange(0, width, 2, device=step.device) * (-math.log(1e4) / width))
     angles = step[:, None] * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
-
-
-def tool_axes(quaternion_wxyz: Float[Tensor, "b 4"]) -> Float[Tensor, "b 6"]:
-    """Where the tool's z and x axes point (D-polarnet-pose)."""
-    w, x, y, z = quaternion_wxyz.unbind(-1)
-    axes = (
-        *(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-        *(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-    )
-    return torch.stack(axes, dim=-1)
 
 
 def _divergence(logits: Float[Tensor, "b n"], label: Float[Tensor, "b n"]) -> Tensor:

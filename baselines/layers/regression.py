@@ -61,11 +61,20 @@ class Regressed:
         )
 
 
+def tool_axes(quaternion_wxyz: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 6"]:
+    """Where the tool's z and x axes point."""
+    w, x, y, z = quaternion_wxyz.unbind(-1)
+    axes = (
+        *(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+        *(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+    )
+    return torch.stack(axes, dim=-1)
+
+
 def grip_numbers(quaternion_wxyz: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 9"]:
     """The grip of unit quaternions; equal for q, -q and their twins."""
-    w, x, y, z = quaternion_wxyz.unbind(-1)
-    tool_x = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    tool_z = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    *tool_z, x, y, z = tool_axes(quaternion_wxyz).unbind(-1)
+    tool_x = (x, y, z)
     outer = (
         scale * tool_x[row] * tool_x[column]
         for row, column, scale in zip(_ROWS, _COLUMNS, _SCALES, strict=True)

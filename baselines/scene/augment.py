@@ -1,8 +1,8 @@
 """Random rigid moves of a whole scene: the cloud and the label together (RVT section 3.3).
 
-The scene turns about the vertical through the label and is then shifted, but not up or down
-(D-heights). After a turn a gripper
-label may leave the canonical half of its symmetry: pass it through `rotation.canonical_yaw`.
+The scene turns about the vertical through the label and is then shifted, in the `cpu` presets
+neither up nor down (D-heights). After a turn a gripper label may leave the canonical half of its
+symmetry: pass it through `rotation.canonical_yaw`.
 """
 
 from dataclasses import dataclass

@@ -17,10 +17,10 @@ from baselines.agents.polarnet import (
     PolarNetConfig,
     heat_labels,
     read_out,
-    tool_axes,
 )
 from baselines.agents.polarnet import load as load_policy
 from baselines.checkpoint import Identity
+from baselines.layers.regression import tool_axes
 from baselines.rotation import bins_to_quaternion, multiply
 from baselines.scene.augment import Augmentation
 from baselines.scene.points import HALF_SIDE_M
