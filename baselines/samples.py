@@ -1,6 +1,6 @@
 """Keyframe files -> samples: which keyframe is shown at which step.
 
-Images stay in memory as stored (RGB u8, depth u16: 330 KB an observation), one shard a task.
+Images stay in memory, compressed (`baselines.packed`), one shard a task.
 What is drawn is a pure function of (seed, step), so a resumed run sees what an unbroken one saw.
 """
 
@@ -14,9 +14,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from baselines.packed import PackedRows
 from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
-from sacil_tasks.keyframes import NO_ROW, OBSERVATION_COLUMNS, Episode, KeyframeFile
+from sacil_tasks.keyframes import (
+    IMAGE_COLUMNS,
+    NO_ROW,
+    OBSERVATION_COLUMNS,
+    Episode,
+    KeyframeFile,
+)
 
 STREAMS = ("rows", "moves", "goals", "points", "torch")
 """Random streams of a step: one more stream never changes what another draws."""
@@ -44,7 +51,10 @@ class Shard:
     episodes: Sequence[Episode]
     first_rows: Sequence[int]
     columns: dict[str, np.ndarray]
-    """Datasets of `observations/` by name, all rows."""
+    """Datasets of `observations/` by name, all rows, but for the images."""
+
+    images: dict[str, PackedRows]
+    """The images (RGB u8, depth u16), all rows."""
 
     @classmethod
     def load(cls, path: Path) -> "Shard":
@@ -54,11 +64,13 @@ class Shard:
             UsageError: missing, truncated or foreign file, or a keyframe outside the render cube.
         """
         with KeyframeFile.open(path) as file:
-            columns = {name: file.column(name) for name in OBSERVATION_COLUMNS}
+            names = [name for name in OBSERVATION_COLUMNS if name not in IMAGE_COLUMNS]
+            columns = {name: file.column(name) for name in names}
+            images = {name: PackedRows(file.column(name)) for name in IMAGE_COLUMNS}
             task, sha256 = file.meta.task, file.content_sha256
             episodes, first_rows = file.episodes, file.first_rows
         _check_in_cube(path, columns["keyframe_in_base"][:, :3])
-        return cls(task, path, sha256, episodes, first_rows, columns)
+        return cls(task, path, sha256, episodes, first_rows, columns, images)
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -90,11 +102,11 @@ class Shard:
         return [row for row in rows if row not in choices] or rows
 
     def observation(self, row: int) -> Observation:
-        """The observation of `row`, as a policy would have seen it; nothing is copied."""
+        """The observation of `row`, as a policy would have seen it."""
         c = self.columns
         return Observation(
-            rgb=c["rgb"][row],
-            depth_mm=c["depth_mm"][row],
+            rgb=self.images["rgb"][row],
+            depth_mm=self.images["depth_mm"][row],
             intrinsics=c["intrinsics"][row],
             camera_in_base=c["camera_in_base"][row],
             tcp_in_base=c["tcp_in_base"][row],

@@ -9,6 +9,7 @@ import torch
 
 from baselines.agent import Recipe
 from baselines.loader import Loader
+from baselines.packed import PackedRows
 from baselines.rotation import bins_to_quaternion
 from baselines.samples import KeyframeSet, Sample, Shard, stream
 from baselines.scene.augment import AugmentConfig
@@ -16,6 +17,7 @@ from baselines.scene.sight import Moment, ViewSight
 from baselines.scene.views import base_from_cube
 from baselines.text import SentenceTable, TextSpec, tidy
 from sacil_tasks.errors import UsageError
+from sacil_tasks.keyframes import IMAGE_COLUMNS
 
 TASKS = ("pick_and_lift", "pick_up_cup")
 STILL = AugmentConfig(yaw_rad=0.0, translation_m=0.0)
@@ -147,13 +149,14 @@ def test_labels_without_augmentation_are_the_commanded_keyframes(keyframes):
 
 def test_label_and_cloud_move_together(keyframes):
     """A scene of one point at the label: wherever it is moved, it is drawn at the label."""
-    columns = {name: column.copy() for name, column in keyframes.shards[0].columns.items()}
-    columns["depth_mm"][:] = 0
-    columns["depth_mm"][:, 0, 40, 80] = 700
     seen = keyframes.shards[0].observation(0)
+    columns = {name: column.copy() for name, column in keyframes.shards[0].columns.items()}
+    depth_mm = np.zeros((len(columns["step"]), *seen.depth_mm.shape), seen.depth_mm.dtype)
+    depth_mm[:, 0, 40, 80] = 700
     ray = np.linalg.inv(seen.intrinsics[0]) @ [80.5, 40.5, 1] * 0.7
     columns["keyframe_in_base"][:, :3] = (seen.camera_in_base[0] @ [*ray, 1])[:3]
-    scene = KeyframeSet([replace(keyframes.shards[0], columns=columns)])
+    images = keyframes.shards[0].images | {"depth_mm": PackedRows(depth_mm)}
+    scene = KeyframeSet([replace(keyframes.shards[0], columns=columns, images=images)])
     batch = loader(scene).batch(0)
     for views, label in zip(batch.inputs.scene.views, batch.labels.position_in_cube, strict=True):
         xyz = views[:, :3].permute(0, 2, 3, 1)[views[:, 3:6].sum(1) > 0]
@@ -174,10 +177,14 @@ def test_paraphrases_share_a_meaning_and_demos_a_trajectory(keyframes):
     assert len(set(batch.trajectory.tolist())) == 12
 
 
-def test_images_stay_as_stored(keyframes):
+def test_images_come_out_of_memory_as_they_are_on_disk(keyframes):
     shard = keyframes.shards[0]
-    assert (shard.columns["rgb"].dtype, shard.columns["depth_mm"].dtype) == (np.uint8, np.uint16)
-    assert shard.observation(0).rgb.base is not None
+    with h5py.File(shard.path) as file:
+        for name in IMAGE_COLUMNS:
+            stored = file[f"observations/{name}"][:]
+            rows = [shard.images[name][row] for row in range(len(stored))]
+            np.testing.assert_array_equal(rows, stored)
+            assert rows[0].dtype == stored.dtype
 
 
 def test_a_missing_file_names_the_command_that_makes_it(tmp_path):
