@@ -59,16 +59,16 @@ class MultiViewConfig:
     head_hidden: tuple[int, int] = (192, 96)
     """Hidden units of the head for rotation, gripper and collision."""
 
-    width: int = 128
+    width: int = 96
     """Width of the transformer."""
 
     heads: int = 2
     """Attention heads."""
 
-    head_width: int = 64
+    head_width: int = 48
     """Width of one head."""
 
-    hidden: int = 256
+    hidden: int = 192
     """Hidden units of the gated feed-forward layers."""
 
     dropout: float = 0.0
