@@ -217,18 +217,22 @@ class CameraSight:
         longest = max(len(observations) for observations in shown)
         pictures = _blank(len(moments), longest)
         for row, (moment, observations) in enumerate(zip(moments, shown, strict=True)):
-            for t, seen in enumerate(observations, start=longest - len(observations)):
+            first = longest - len(observations)
+            for images in (pictures.rgb, pictures.xyz_in_cube, pictures.seen):
+                images[row, :first] = 0
+            for t, seen in enumerate(observations, start=first):
                 _fill(pictures, row, t, seen, moment.move)
         return pictures
 
 
 def _blank(rows: int, steps: int) -> Pictures:
+    """Steps that did not happen, but for the images, which hold anything."""
     frames, side = (rows, steps, len(CAMERAS)), IMAGE_PIXELS
     # In memory colours come last, as the cameras give them and as convolutions like them.
     return Pictures(
-        rgb=torch.zeros((*frames, side, side, 3), dtype=torch.uint8).movedim(-1, 3),
-        xyz_in_cube=torch.zeros((*frames, 3, side, side)),
-        seen=torch.zeros((*frames, side, side), dtype=torch.bool),
+        rgb=torch.empty((*frames, side, side, 3), dtype=torch.uint8).movedim(-1, 3),
+        xyz_in_cube=torch.empty((*frames, 3, side, side)),
+        seen=torch.empty((*frames, side, side), dtype=torch.bool),
         gripper_in_cube=torch.zeros((rows, steps, 7)),
         gripper_px=torch.full((*frames, 2), -torch.inf),
         happened=torch.zeros((rows, steps), dtype=torch.bool),

@@ -42,7 +42,8 @@ def test_the_present_comes_last_and_shorter_histories_are_padded_before(episode)
     for t in range(3):
         expected = torch.from_numpy(episode[t].rgb).permute(0, 3, 1, 2)
         assert torch.equal(pictures.rgb[0, t], expected)
-    assert not pictures.seen[1, :2].any()
+    for padding in (pictures.rgb, pictures.xyz_in_cube, pictures.seen):
+        assert not padding[1, :2].any()
 
 
 def test_only_as_many_steps_as_asked_for_are_shown(episode):
