@@ -4,8 +4,9 @@
     python benchmarks/bench_evaluation.py --records results/test/rvt/episodes.jsonl
 
 Plays the same episodes of `val` with one worker and with two, by turns, and keeps nothing. The
-split is that of one worker: `setup` builds the scene and has the expert plan it, `rest` is the
-harness itself. With `--records` nothing is played: the split is that of episodes played before.
+split is that of one worker: `setup` builds the scene, `planning` includes the expert's plans by
+which a scene is accepted, `rest` is the harness itself. With `--records` nothing is played: the
+split is that of episodes played before.
 """
 
 import tempfile

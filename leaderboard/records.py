@@ -47,8 +47,9 @@ class Seconds:
 
     total: float = 0.0
     setup: float = 0.0
-    """Building the scene and, for its first words, checking that the expert can solve it."""
+    """Building the scene."""
     planning: float = 0.0
+    """Of the policy's keyframes and, for a scene's first words, of the expert's under all words."""
     physics: float = 0.0
     rendering: float = 0.0
     inference: float = 0.0

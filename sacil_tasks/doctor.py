@@ -183,10 +183,12 @@ def run_in_child(code: str) -> str:
 def plan_one_keyframe() -> str:
     """Accept a scene, plan the expert's first keyframe, move there. Runs in the child."""
     with _episode(render=False) as stage:
+        accepted = stage.seconds
         refusal = stage.execute(stage.expert_keyframe(0)).refusal
         if refusal:
             raise UsageError(f"the expert's first keyframe was refused: {refusal}")
-        planning_ms, scene_s = 1000 * stage.seconds["planning"], stage.seconds["scenes"]
+        planning_ms = 1000 * (stage.seconds["planning"] - accepted["planning"])
+        scene_s = accepted["scenes"] + accepted["planning"]
     return f"keyframe planned in {planning_ms:.0f} ms, scene accepted in {scene_s:.2f} s"
 
 

@@ -79,10 +79,11 @@ class Stage:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Seconds spent so far on scenes (reset and acceptance), planning, physics, rendering."""
+        """Seconds spent so far on scenes (their reset), planning (also to accept a scene), physics
+        and rendering."""
         spent = dict(self._seconds) | {"physics": self.recorder.physics_s}
-        spent["planning"] = spent.pop("execution", 0.0) - self.recorder.physics_s
-        return spent
+        planning = spent.pop("execution", 0.0) + spent.pop("acceptance", 0.0)
+        return spent | {"planning": planning - self.recorder.physics_s}
 
     def begin(
         self, scene: SceneKey, *, variation: int, template: int | None = None, split: str = "canon"
@@ -91,14 +92,12 @@ class Stage:
 
         `template` None: as the scene's instruction stream draws it.
         """
-        started = time.perf_counter()
         slots = variations(self.spec, split)[variation]
         known = scene in self._accepted
         if not known:
             self._accepted[scene] = self._find_attempt(scene, slots, template)
         if known or split != "canon":
             self._reset(scene, self._accepted[scene], slots, template, split)
-        self._seconds["scenes"] += time.perf_counter() - started
         return self.env.get_language_instruction()[0]
 
     def observe(self) -> Observation:
@@ -152,7 +151,9 @@ class Stage:
         """The first attempt that the expert can plan; it has been reset."""
         for attempt in range(ATTEMPTS):
             self._reset(scene, attempt, slots, template, "canon")
+            started = time.perf_counter()
             refusal = self._executor.plan_sequences(map(self._expert, variations(self.spec)))
+            self._seconds["acceptance"] += time.perf_counter() - started
             self.env.ask(slots)
             if refusal is None:
                 return attempt
@@ -161,6 +162,7 @@ class Stage:
     def _reset(
         self, scene: SceneKey, attempt: int, slots: Slots, template: int | None, split: str
     ) -> None:
+        started = time.perf_counter()
         self.attempt = attempt
         self.seed = scene_seed(scene.partition, scene.scene_set, scene.task, scene.index, attempt)
         if template is None:
@@ -169,6 +171,7 @@ class Stage:
         self.recorder.reset(seed=self.seed, options=dict(self.options))
         self._executor.begin()
         self._steps, self._gripper_open = 0, True
+        self._seconds["scenes"] += time.perf_counter() - started
 
     def _expert(self, words: Slots) -> list[Keyframe]:
         """All keyframes of the expert if `words` were asked for."""
