@@ -70,6 +70,9 @@ class TrainConfig:
     validate_every: int = 1000
     """Steps between validations; 0 for none."""
 
+    tensorboard: bool = False
+    """Copy the metrics for TensorBoard into the folder's `events` (needs tensorboardX)."""
+
     def __post_init__(self) -> None:
         """Reject contradictions.
 

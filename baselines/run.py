@@ -67,6 +67,8 @@ class Run:
         self, trainer: Trainer, folder: Path, plan: Mapping[str, Any], *, validate: Validator | None
     ) -> None:
         """`plan` is what a resumed run must agree with; `validate` gives a row of metrics."""
+        self.listeners: list[Callable[[Row], None]] = []
+        """Told of every line of `metrics.jsonl`; on the first rank alone."""
         self.trainer = trainer
         self.folder = folder
         self.plan = plan
@@ -183,7 +185,7 @@ class Run:
         pace = round(self.trainer.recipe.batch / total, 2)
         timing = {"samples_per_s": pace, "cpu_s": round(self.cpu_s, 1)}
         if rank() == 0:
-            append_row(self.folder / METRICS, row | timing | shares)
+            self._tell(row | timing | shares)
         return means["loss"]
 
     def _log_validation(self) -> None:
@@ -195,7 +197,12 @@ class Run:
         row = {"kind": "val", "step": self.trainer.step, **self._validate(network.eval())}
         network.load_state_dict(raw)
         network.train()
+        self._tell(row)
+
+    def _tell(self, row: Row) -> None:
         append_row(self.folder / METRICS, row)
+        for listener in self.listeners:
+            listener(row)
 
 
 def append_row(path: Path, row: Row) -> None:

@@ -22,6 +22,7 @@ from baselines.distributed import of_first, process_group, rank, wait_for_all
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
 from baselines.run import Run, read_rows
+from baselines.tensorboard import event_log
 from sacil_tasks.errors import UsageError, run_command
 from sacil_tasks.files import sole_writer
 
@@ -59,6 +60,8 @@ def main(job: Job) -> None:
     wait_for_all()  # no rank may take what another begins for an earlier run
     with sole_writer(options.folder) if rank() == 0 else nullcontext():
         run = _begin(material) if state is None else _continue(material, state)
+        if options.tensorboard and rank() == 0:
+            run.listeners.append(event_log(options.folder, after_step=run.trainer.step))
         run.finish(validate_every=options.validate_every)
     if rank() == 0:
         _report(options.folder)

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import synthetic
 import torch
+from tensorboardX.proto import event_pb2
 
 from baselines import agent, run, trainer
 from baselines.checkpoint import CONFIG, METRICS, MODEL, PROVENANCE, STATE, TrainState, load
 from baselines.options import parse
 from baselines.run import Means, read_rows
+from baselines.tensorboard import EVENTS
 from baselines.train import main
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import sole_writer
@@ -86,6 +88,29 @@ def test_metrics_have_means_of_what_existed_and_validation(unbroken):
     assert [row["step"] for row in rows if row["kind"] == "val"] == [4, 8, 12]
     assert {"loss", "position", "goal", "lr"} <= set(rows[0])
     assert "never" not in rows[0]  # a term that was NaN at every step
+
+
+def test_tensorboard_gets_the_numbers_of_the_metrics(data, tmp_path):
+    train(data, tmp_path, "--steps", "4", "--validate-every", "4", "--tensorboard")
+    rows = read_rows(tmp_path / METRICS)
+    shown = {(name, step): value for name, step, value in events(tmp_path / EVENTS)}
+    for row in (row for row in rows if row["kind"] == "train"):
+        assert shown["train/loss", row["step"]] == pytest.approx(row["loss"])
+    scores = rows[-1]["all"] if rows[-1]["kind"] == "val" else rows[-2]["all"]
+    assert shown["val/all/position_mm", 4] == pytest.approx(scores["position_mm"])
+    right, of = scores["selected_by_words"]
+    assert shown["val/all/selected_by_words", 4] == pytest.approx(right / of)
+
+
+def events(folder):
+    """Name, step and value of every scalar in the event files: records of length, two checksums."""
+    (path,) = folder.iterdir()
+    content, at = path.read_bytes(), 0
+    while at < len(content):
+        size = int.from_bytes(content[at : at + 8], "little")
+        event = event_pb2.Event.FromString(content[at + 12 : at + 12 + size])
+        yield from ((value.tag, event.step, value.simple_value) for value in event.summary.value)
+        at += size + 16
 
 
 def test_official_sentences_need_no_encoder(unbroken, monkeypatch):
