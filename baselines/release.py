@@ -39,7 +39,8 @@ def main(config: ReleaseConfig) -> None:
             f"{config.run} was trained on {', '.join(identity.tasks)}, but the suite "
             f"{config.suite} is {', '.join(tasks)}. Choose the run's suite with --suite."
         )
-    target = released_folder(identity.agent) / config.suite
+    variant = f".{identity.variant}" if identity.variant else ""
+    target = released_folder(identity.agent) / f"{config.suite}{variant}"
     export_release(config.run, target)
     print(f"released {config.run} as {target}")
 

@@ -186,6 +186,17 @@ def test_a_release_is_named_after_the_suite_it_was_trained_on(folder, tmp_path, 
     assert (tmp_path / "tiny" / "slice" / MODEL).is_file()
 
 
+def test_a_variant_is_released_beside_its_agent(folder, tmp_path, monkeypatch):
+    for module in (release, checkpoint):
+        monkeypatch.setattr(module, "released_folder", lambda agent: tmp_path / agent)
+    edit_config(folder, tasks=suite_tasks("slice"))
+    release.main(ReleaseConfig(run=folder))
+    edit_config(folder, variant="goals")
+    release.main(ReleaseConfig(run=folder))
+    for name, target in (("tiny", "slice"), ("tiny:goals", "slice.goals")):
+        assert checkpoint.find_released(name, TASKS) == tmp_path / "tiny" / target
+
+
 def test_embeddings_of_another_encoder_are_named_by_their_fingerprint(folder):
     edit_config(folder, text=asdict(replace(TEXT_SPEC, fingerprint="1" * 64)))
     with pytest.raises(UsageError, match=r"fake \(000000000000\), but .* fake \(111111111111\)"):

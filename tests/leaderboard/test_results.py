@@ -32,6 +32,12 @@ def test_every_agent_has_a_test_run():
     assert {RESULTS / "test" / agent for agent in AGENTS} <= set(RUNS)
 
 
+def test_every_release_was_evaluated():
+    played = {record.checkpoint for run in RUNS for record in records_of(run)[:1]}
+    for config in ROOT.glob("*/released/*/*/config.json"):
+        assert sha256(config.parent) in played, config.parent
+
+
 @each_run
 def test_the_summary_is_what_the_episodes_come_to(run, tmp_path):
     write_summary(tmp_path / "summary.csv", records_of(run))
@@ -48,9 +54,15 @@ def test_scenes_and_rules_are_those_of_this_code(run):
 @each_run
 def test_weights_are_the_released_ones(run):
     agent = records_of(run)[0].agent
-    released = released_folder(agent) / "slice" if agent in ("sacil", "rvt") else None
-    expected = sha256(released) if released else None
+    expected = None if agent in AGENTS[2:] else sha256(release_of(agent, run))
     assert {record.checkpoint for record in records_of(run)} == {expected}
+
+
+def release_of(agent: str, run: Path) -> Path:
+    """The release whose weights played."""
+    name, _, variant = agent.partition(":")
+    suite = "single" if run.parent.name == "single" else "slice"
+    return released_folder(name) / (f"{suite}.{variant}" if variant else suite)
 
 
 def test_all_agents_met_the_same_scenes():
