@@ -32,7 +32,7 @@ from torch.nn import functional
 
 from baselines import heatmap
 from baselines.agent import Network, agent_modules, find_agent
-from baselines.agents import hiveformer, polarnet, rvt, rvt2
+from baselines.agents import act3d, hiveformer, polarnet, rvt, rvt2
 from baselines.batch import Batch, Inputs, Labels
 from baselines.layers import attention, pointnet, rotary, stems, unet
 from baselines.layers.stems import leaky
@@ -120,6 +120,38 @@ def plain_unet_decoder(self: unet.UnetDecoder, grid: Tensor, skips: list[Tensor]
     return self.heat(unet.doubled(x))[:, 0]
 
 
+def plain_turns(points_m: Tensor, width: int, rad_per_m: float) -> tuple[Tensor, Tensor]:
+    """Cosines and sines."""
+    code = rotary.turns(points_m, width, rad_per_m)
+    return code.real.contiguous(), code.imag.contiguous()
+
+
+def plain_turned(x: Tensor, code: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Both halves of the channels times cosines and sines."""
+    if code is None:
+        return x
+    (cos, sin), (first, second) = code, x.chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+
+
+def plain_memories(self: rotary.Reader, context: rotary.Context) -> list[rotary.Context]:
+    """Each block projects the context itself."""
+    return [context] * len(self.blocks)
+
+
+def plain_relative(
+    self: rotary.RelativeAttention, x: Tensor, code: Any, context: rotary.Context
+) -> Tensor:
+    """Queries, keys and values by three products; halves of the channels are turned."""
+    heads = "b n (two h p) -> b h n (two p)"
+    q = rearrange(plain_turned(self.to_q(x), code), heads, two=2, h=self.heads)
+    k = plain_turned(self.to_k(context.tokens), context.code)
+    k = rearrange(k, heads, two=2, h=self.heads)
+    v = rearrange(self.to_v(context.tokens), "b n (h d) -> b h n d", h=self.heads)
+    read = plain_attend(q, k, v, bias=context.bias)
+    return self.to_out(rearrange(read, "b h q d -> b q (h d)"))
+
+
 def plain_gathered(features: Tensor, index: Tensor) -> Tensor:
     """Rows by plain indexing."""
     return features[torch.arange(len(features))[:, None, None], index.long()]
@@ -165,11 +197,14 @@ def plain_convex_mix(cells: Tensor, shares: Tensor) -> Tensor:
 
 
 PLAIN: list[tuple[Any, str, Any]] = [
-    *((module, "attend", plain_attend) for module in (attention, rotary, pointnet, hiveformer)),
-    *((module, "trimmed_text", whole_text) for module in (rvt, sacil, hiveformer, polarnet)),
+    *((module, "attend", plain_attend) for module in (attention, pointnet, hiveformer)),
+    *((module, "trimmed_text", whole_text) for module in (rvt, sacil, hiveformer, polarnet, act3d)),
     *((module, "side_by_side", plain_side_by_side) for module in (stems, unet)),
     (attention.Attention, "forward", plain_itself),
     (attention.Attention, "across", plain_across),
+    (act3d, "turns", plain_turns),
+    (rotary.Reader, "memories", plain_memories),
+    (rotary.RelativeAttention, "forward", plain_relative),
     (stems, "conv_of_upsampled", plain_conv_of_upsampled),
     (unet.UnetDecoder, "forward", plain_unet_decoder),
     (pointnet, "gathered", plain_gathered),

@@ -31,9 +31,10 @@ def slow_attention(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.T
     return torch.einsum("b h q t, b h t d -> b h q d", scores.softmax(-1), v)
 
 
+@pytest.mark.parametrize("width", [8, 16, 30])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.bfloat16, 0.03)])
-def test_attention_is_softmax_of_products(dtype: torch.dtype, tolerance: float) -> None:
-    q, k, v = torch.randn(3, 2, 2, 7, 8).unbind()
+def test_attention_is_softmax_of_products(dtype: torch.dtype, tolerance: float, width: int) -> None:
+    q, k, v = torch.randn(3, 2, 2, 7, width).unbind()
     found = attend(q.to(dtype), k.to(dtype), v.to(dtype)).float()
     torch.testing.assert_close(found, slow_attention(q, k, v), rtol=0, atol=tolerance)
 
