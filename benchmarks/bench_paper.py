@@ -97,6 +97,12 @@ def plain_itself(self: attention.Attention, x: Tensor, bias: Tensor | None = Non
     return plain_across(self, x, x, bias)
 
 
+def plain_feed_forward(self: attention.FeedForward, x: Tensor) -> Tensor:
+    """The gate as autograd takes it."""
+    value, gate = self.rise(x).chunk(2, dim=-1)
+    return self.fall(value * functional.gelu(gate))
+
+
 def whole_text(inputs: Inputs) -> tuple[Tensor, Tensor]:
     """Text with its padding."""
     return inputs.text, inputs.text_mask
@@ -163,7 +169,8 @@ def plain_abstraction(
     """Neighbours are gathered, then each is lifted; the strongest is a maximum over one axis."""
     count = near.shape[1]
     offsets = (plain_gathered(xyz, near) - xyz[:, :count, None]) / self.radius
-    said = self.neighbours(self.lift(plain_gathered(features, near)) + self.offset(offsets))
+    joined = self.lift(plain_gathered(features, near)) + self.offset(offsets)
+    said = self.neighbours(joined.flatten(0, 2)).unflatten(0, near.shape)
     return functional.relu(self.norm(said.amax(2) + self.skip(features[:, :count])))
 
 
@@ -202,6 +209,7 @@ PLAIN: list[tuple[Any, str, Any]] = [
     *((module, "side_by_side", plain_side_by_side) for module in (stems, unet)),
     (attention.Attention, "forward", plain_itself),
     (attention.Attention, "across", plain_across),
+    (attention.FeedForward, "forward", plain_feed_forward),
     (act3d, "turns", plain_turns),
     (rotary.Reader, "memories", plain_memories),
     (rotary.RelativeAttention, "forward", plain_relative),

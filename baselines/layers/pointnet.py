@@ -53,7 +53,8 @@ class PerRow(nn.Module):
 
     def forward(self, x: Float[Tensor, "*rows c"]) -> Float[Tensor, "*rows c"]:
         """Normalise each channel."""
-        return self.norm(x.flatten(0, -2)).view_as(x)
+        # No view where none is needed: what is done to a view in place costs two more passes.
+        return self.norm(x) if x.ndim == 2 else self.norm(x.flatten(0, -2)).view_as(x)
 
 
 def point_norm(norm: Norm, channels: int) -> nn.Module:
@@ -97,8 +98,10 @@ class SetAbstraction(nn.Module):
     ) -> Float[Tensor, "b m e"]:
         """Features of the first `m` points from those of `n`; `xyz` may go on after these."""
         count = near.shape[1]
-        offsets = (gathered(xyz, near) - xyz[:, :count, None]) / self.radius
-        said = self.neighbours(gathered(self.lift(features), near) + self.offset(offsets))
+        with torch.autocast(xyz.device.type, enabled=False):  # differences of large numbers
+            places = self.offset(xyz[:, : features.shape[1]] / self.radius)
+        joined = gathered(self.lift(features) + places, near) - places[:, :count, None]
+        said = self.neighbours(joined.flatten(0, 2)).unflatten(0, near.shape)
         return functional.relu(self.norm(strongest(said) + self.skip(features[:, :count])))
 
 
