@@ -41,6 +41,7 @@ from baselines.rotation import canonical_yaw, quaternion_to_bins
 from baselines.scene.sight import Moment
 from baselines.scene.views import VIEWS, project
 from baselines.text import TextSpec
+from baselines.trainer import keep_freed_memory
 from sacil_agent.agents import sacil
 from sacil_tasks.errors import run_command
 from sacil_tasks.interface import MAX_KEYFRAMES, Observation
@@ -71,6 +72,9 @@ class BenchConfig:
 
     pixels: int = 220
     """Side of the heatmaps to decode; 0 for none."""
+
+    keep_memory: bool = False
+    """Let both versions reuse freed memory, as training does; else the system clears it anew."""
 
 
 def plain_attend(
@@ -304,6 +308,8 @@ def gradients_of(network: Network) -> dict[str, Tensor]:
 def time_agent(name: str, config: BenchConfig) -> str:
     """One line of the table."""
     torch.set_num_threads(config.threads)
+    if config.keep_memory:
+        keep_freed_memory()
     torch.manual_seed(0)
     spec, variant = find_agent(name)
     network = spec.create(spec.config("paper", variant), TEXT).train()

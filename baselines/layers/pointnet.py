@@ -100,7 +100,8 @@ class SetAbstraction(nn.Module):
         count = near.shape[1]
         with torch.autocast(xyz.device.type, enabled=False):  # differences of large numbers
             places = self.offset(xyz[:, : features.shape[1]] / self.radius)
-        joined = gathered(self.lift(features) + places, near) - places[:, :count, None]
+        # Added, not subtracted: the way back would negate every neighbour's gradient.
+        joined = gathered(self.lift(features) + places, near) + -places[:, :count, None]
         said = self.neighbours(joined.flatten(0, 2)).unflatten(0, near.shape)
         return functional.relu(self.norm(strongest(said) + self.skip(features[:, :count])))
 
