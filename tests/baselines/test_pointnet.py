@@ -1,10 +1,12 @@
 """Layers of the point network against the same steps written out."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from torch import Tensor
 
-from baselines.layers.pointnet import Norm, SetAbstraction
+from baselines.layers.pointnet import Norm, PerRow, SetAbstraction
 
 SAMPLES, POINTS, CENTRES, NEIGHBOURS, CHANNELS = 2, 12, 5, 4, 8
 
@@ -23,15 +25,19 @@ def written_out(block: SetAbstraction, features: Tensor, xyz: Tensor, near: Tens
 def test_an_abstraction_is_the_maximum_over_neighbours(norm: Norm) -> None:
     torch.manual_seed(0)
     block = SetAbstraction(CHANNELS, 2 * CHANNELS, radius=0.05, norm=norm)
+    for parameter in block.parameters():  # scales of both signs
+        torch.nn.init.normal_(parameter)
     features = torch.randn(SAMPLES, POINTS, CHANNELS, requires_grad=True)
     xyz = torch.rand(SAMPLES, POINTS + 3, 3)
     near = torch.randint(POINTS, (SAMPLES, CENTRES, NEIGHBOURS), dtype=torch.int32)
-    inputs = [features, *block.parameters()]
-    expected = written_out(block, features, xyz, near)
-    found = block(features, xyz, near)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    pairs = (torch.autograd.grad(out.square().sum(), inputs) for out in (found, expected))
-    for one, other in zip(*pairs, strict=True):
+    twin, answers = deepcopy(block), []
+    for network, out in (
+        (block, block(features, xyz, near)),
+        (twin, written_out(twin, features, xyz, near)),
+    ):
+        inputs = [features, *network.parameters()]
+        answers.append([out, *torch.autograd.grad(out.square().sum(), inputs)])
+    for one, other in zip(*answers, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
 
 
@@ -41,9 +47,23 @@ def test_places_are_not_rounded_in_bf16() -> None:
     features, near = torch.zeros(1, 2, CHANNELS), torch.tensor([[[1]]], dtype=torch.int32)
     close = torch.tensor([[[0.95, 0.9, 0.92], [0.953, 0.9, 0.92]]])
     seen: list[Tensor] = []
-    block.neighbours.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
+    block.neighbours[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
     with torch.autocast("cpu", torch.bfloat16):
         block(features, close, near)
     offset = block.offset((close[:, 1] - close[:, 0]) / block.radius)
     expected = offset + block.lift(features[:, 1])
     torch.testing.assert_close(seen[0].float(), expected, rtol=0.02, atol=2e-3)
+
+
+def test_batch_norm_keeps_its_statistics_where_only_the_strongest_are_normalised() -> None:
+    torch.manual_seed(0)
+    rows, weight = torch.randn(2, 3, 4, CHANNELS), torch.randn(6, CHANNELS)
+    ours, reference = PerRow(6), PerRow(6)
+    for norm in (ours, reference):
+        norm.norm.weight.data = torch.tensor([1.0, -1.0, 0.5, -0.5, 0.0, 2.0])
+    for training in (True, True, False):
+        found = ours.train(training).strongest(rows, weight)
+        expected = reference.train(training)(rows @ weight.T).amax(2)
+        torch.testing.assert_close(found, expected)
+    for name, value in reference.state_dict().items():
+        torch.testing.assert_close(ours.state_dict()[name], value)
