@@ -151,10 +151,11 @@ class SetAbstraction(nn.Module):
         count = near.shape[1]
         with torch.autocast(xyz.device.type, enabled=False):  # differences of large numbers
             places = self.offset(xyz[:, : features.shape[1]] / self.radius)
+        lifted = self.lift(features)
         # Added, not subtracted: the way back would negate every neighbour's gradient.
-        joined = gathered(self.lift(features) + places, near) + -places[:, :count, None]
-        hidden = self.neighbours[:-2](joined.flatten(0, 2)).unflatten(0, near.shape)
-        said = self._strongest(hidden) + self.skip(features[:, :count])
+        joined = gathered(lifted + places, near) + -places[:, :count, None]
+        hidden = self.neighbours[:-2](joined.flatten(0, 2).to(lifted.dtype))
+        said = self._strongest(hidden.unflatten(0, near.shape)) + self.skip(features[:, :count])
         return functional.relu(self.norm(said))
 
     def _strongest(self, hidden: Float[Tensor, "b m k c"]) -> Float[Tensor, "b m e"]:
