@@ -32,7 +32,7 @@ from torch.nn import functional
 
 from baselines import heatmap
 from baselines.agent import Network, agent_modules, find_agent
-from baselines.agents import hiveformer, polarnet, rvt, rvt2
+from baselines.agents import act3d, hiveformer, polarnet, rvt, rvt2
 from baselines.batch import Batch, Inputs, Labels
 from baselines.layers import attention, pointnet, rotary, stems, unet
 from baselines.layers.stems import leaky
@@ -41,6 +41,7 @@ from baselines.rotation import canonical_yaw, quaternion_to_bins
 from baselines.scene.sight import Moment
 from baselines.scene.views import VIEWS, project
 from baselines.text import TextSpec
+from baselines.trainer import keep_freed_memory
 from sacil_agent.agents import sacil
 from sacil_tasks.errors import run_command
 from sacil_tasks.interface import MAX_KEYFRAMES, Observation
@@ -72,6 +73,9 @@ class BenchConfig:
     pixels: int = 220
     """Side of the heatmaps to decode; 0 for none."""
 
+    keep_memory: bool = False
+    """Let both versions reuse freed memory, as training does; else the system clears it anew."""
+
 
 def plain_attend(
     q: Tensor, k: Tensor, v: Tensor, *, bias: Tensor | None = None, dropout: float = 0.0
@@ -97,6 +101,12 @@ def plain_itself(self: attention.Attention, x: Tensor, bias: Tensor | None = Non
     return plain_across(self, x, x, bias)
 
 
+def plain_feed_forward(self: attention.FeedForward, x: Tensor) -> Tensor:
+    """The gate as autograd takes it."""
+    value, gate = self.rise(x).chunk(2, dim=-1)
+    return self.fall(value * functional.gelu(gate))
+
+
 def whole_text(inputs: Inputs) -> tuple[Tensor, Tensor]:
     """Text with its padding."""
     return inputs.text, inputs.text_mask
@@ -120,6 +130,38 @@ def plain_unet_decoder(self: unet.UnetDecoder, grid: Tensor, skips: list[Tensor]
     return self.heat(unet.doubled(x))[:, 0]
 
 
+def plain_turns(points_m: Tensor, width: int, rad_per_m: float) -> tuple[Tensor, Tensor]:
+    """Cosines and sines."""
+    code = rotary.turns(points_m, width, rad_per_m)
+    return code.real.contiguous(), code.imag.contiguous()
+
+
+def plain_turned(x: Tensor, code: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Both halves of the channels times cosines and sines."""
+    if code is None:
+        return x
+    (cos, sin), (first, second) = code, x.chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+
+
+def plain_memories(self: rotary.Reader, context: rotary.Context) -> list[rotary.Context]:
+    """Each block projects the context itself."""
+    return [context] * len(self.blocks)
+
+
+def plain_relative(
+    self: rotary.RelativeAttention, x: Tensor, code: Any, context: rotary.Context
+) -> Tensor:
+    """Queries, keys and values by three products; halves of the channels are turned."""
+    heads = "b n (two h p) -> b h n (two p)"
+    q = rearrange(plain_turned(self.to_q(x), code), heads, two=2, h=self.heads)
+    k = plain_turned(self.to_k(context.tokens), context.code)
+    k = rearrange(k, heads, two=2, h=self.heads)
+    v = rearrange(self.to_v(context.tokens), "b n (h d) -> b h n d", h=self.heads)
+    read = plain_attend(q, k, v, bias=context.bias)
+    return self.to_out(rearrange(read, "b h q d -> b q (h d)"))
+
+
 def plain_gathered(features: Tensor, index: Tensor) -> Tensor:
     """Rows by plain indexing."""
     return features[torch.arange(len(features))[:, None, None], index.long()]
@@ -131,7 +173,8 @@ def plain_abstraction(
     """Neighbours are gathered, then each is lifted; the strongest is a maximum over one axis."""
     count = near.shape[1]
     offsets = (plain_gathered(xyz, near) - xyz[:, :count, None]) / self.radius
-    said = self.neighbours(self.lift(plain_gathered(features, near)) + self.offset(offsets))
+    joined = self.lift(plain_gathered(features, near)) + self.offset(offsets)
+    said = self.neighbours(joined.flatten(0, 2)).unflatten(0, near.shape)
     return functional.relu(self.norm(said.amax(2) + self.skip(features[:, :count])))
 
 
@@ -165,11 +208,15 @@ def plain_convex_mix(cells: Tensor, shares: Tensor) -> Tensor:
 
 
 PLAIN: list[tuple[Any, str, Any]] = [
-    *((module, "attend", plain_attend) for module in (attention, rotary, pointnet, hiveformer)),
-    *((module, "trimmed_text", whole_text) for module in (rvt, sacil, hiveformer, polarnet)),
+    *((module, "attend", plain_attend) for module in (attention, pointnet, hiveformer)),
+    *((module, "trimmed_text", whole_text) for module in (rvt, sacil, hiveformer, polarnet, act3d)),
     *((module, "side_by_side", plain_side_by_side) for module in (stems, unet)),
     (attention.Attention, "forward", plain_itself),
     (attention.Attention, "across", plain_across),
+    (attention.FeedForward, "forward", plain_feed_forward),
+    (act3d, "turns", plain_turns),
+    (rotary.Reader, "memories", plain_memories),
+    (rotary.RelativeAttention, "forward", plain_relative),
     (stems, "conv_of_upsampled", plain_conv_of_upsampled),
     (unet.UnetDecoder, "forward", plain_unet_decoder),
     (pointnet, "gathered", plain_gathered),
@@ -261,6 +308,8 @@ def gradients_of(network: Network) -> dict[str, Tensor]:
 def time_agent(name: str, config: BenchConfig) -> str:
     """One line of the table."""
     torch.set_num_threads(config.threads)
+    if config.keep_memory:
+        keep_freed_memory()
     torch.manual_seed(0)
     spec, variant = find_agent(name)
     network = spec.create(spec.config("paper", variant), TEXT).train()

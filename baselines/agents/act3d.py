@@ -27,6 +27,7 @@ from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Prediction
 from baselines.layers import ghosts
 from baselines.layers.attention import padding_bias
+from baselines.layers.multiview import trimmed_text
 from baselines.layers.regression import POSE, UNTURNED, Regressed
 from baselines.layers.resnet import ResNet50
 from baselines.layers.rotary import Context, Reader, Turns, turns
@@ -151,10 +152,12 @@ class Cells:
 
     def nearest(self, center: Float[Tensor, "b 3"], count: int) -> "Cells":
         """The `count` cells nearest to a point; unseen ones are the farthest."""
+        if count >= self.tokens.shape[1]:
+            return self
         distance = (self.xyz_in_cube - center[:, None]).square().sum(-1)
         distance = distance.masked_fill(~self.seen, torch.inf)
         rows = torch.arange(len(distance), device=distance.device)[:, None]
-        index = distance.topk(min(count, distance.shape[1]), largest=False, sorted=False).indices
+        index = distance.topk(count, largest=False, sorted=False).indices
         return Cells(
             self.tokens[rows, index], self.xyz_in_cube[rows, index], self.seen[rows, index]
         )
@@ -223,8 +226,9 @@ class Act3d(Network):
     def forward(self, inputs: Inputs[Pictures], place: Place) -> Detection:
         """Guess level by level; `place` says where the ghosts of each level are."""
         coarse, fine = self._cells(inputs.scene)
-        words = Context(self.text(inputs.text), None, padding_bias(inputs.text_mask))
-        query = self.query.expand(len(inputs.text), 1, -1)
+        text, mask = trimmed_text(inputs)
+        words = Context(self.text(text), None, padding_bias(mask))
+        query = self.query.expand(len(text), 1, -1)
         guess = torch.zeros_like(inputs.gripper_in_cube[:, :3])
         levels: list[Level] = []
         for index in range(len(self.config.radii_m) + 1):
@@ -264,12 +268,12 @@ class Act3d(Network):
         """Cells and gripper, both after reading the words; then the words, at the cube's centre."""
         gripper = self.gripper.expand(len(cells.tokens), 1, -1)
         tokens = self.read_words(torch.cat([cells.tokens, gripper], dim=1), None, words)
-        hand, nowhere = inputs.gripper_in_cube[:, None, :3], torch.zeros_like(inputs.text[..., :3])
-        real = torch.cat([cells.seen, cells.seen.new_ones(len(tokens), 1), inputs.text_mask], dim=1)
+        hand, nowhere = inputs.gripper_in_cube[:, None, :3], torch.zeros_like(words.tokens[..., :3])
+        here = padding_bias(functional.pad(cells.seen, (0, 1), value=True))
         return Context(
             tokens=torch.cat([tokens, words.tokens], dim=1),
             code=self._code(torch.cat([cells.xyz_in_cube, hand, nowhere], dim=1)),
-            bias=padding_bias(real),
+            bias=torch.cat([here, words.bias], dim=-1),
         )
 
     def _score(

@@ -6,7 +6,7 @@ Where a linear layer reads gathered points it is applied before they are gathere
 for a fraction of the products.
 """
 
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from einops import rearrange
@@ -21,6 +21,9 @@ Norm: TypeAlias = Literal["batch", "layer"]
 
 EPS = 1e-12
 """Of the decoder's layer norms."""
+
+MOMENTUM = 0.1
+"""Share of a batch in the running statistics of batch norm."""
 
 
 def gathered(
@@ -49,11 +52,60 @@ class PerRow(nn.Module):
     def __init__(self, channels: int) -> None:
         """Learned scale and shift."""
         super().__init__()
-        self.norm = nn.BatchNorm1d(channels)
+        self.norm = nn.BatchNorm1d(channels, momentum=MOMENTUM)
 
     def forward(self, x: Float[Tensor, "*rows c"]) -> Float[Tensor, "*rows c"]:
         """Normalise each channel."""
-        return self.norm(x.flatten(0, -2)).view_as(x)
+        # No view where none is needed: what is done to a view in place costs two more passes.
+        return self.norm(x) if x.ndim == 2 else self.norm(x.flatten(0, -2)).view_as(x)
+
+    def strongest(
+        self, x: Float[Tensor, "b m k d"], weight: Float[Tensor, "c d"]
+    ) -> Float[Tensor, "b m c"]:
+        """`strongest` of the normalised products of `x` and `weight`, without normalising others.
+
+        A norm keeps the order within a channel; where its scale is negative it turns it round, so
+        there the product is turned round before.
+        """
+        sign = torch.where(self.norm.weight.detach() < 0, -1.0, 1.0)
+        best, mean, variance = _Peaks.apply(functional.linear(x, weight * sign[:, None]))
+        kept = dict(self.norm.named_buffers())
+        if self.training:
+            count = x.shape[:-1].numel()
+            kept["num_batches_tracked"].add_(1)
+            kept["running_mean"].lerp_(sign * mean.detach(), MOMENTUM)
+            kept["running_var"].lerp_(count / (count - 1) * variance.detach(), MOMENTUM)
+        else:
+            mean, variance = sign * kept["running_mean"], kept["running_var"]
+        scale = sign * self.norm.weight * (variance + self.norm.eps).rsqrt()
+        return (best - mean) * scale + self.norm.bias
+
+
+class _Peaks(torch.autograd.Function):
+    """The maximum over neighbours, and mean and variance over all rows.
+
+    The way back is one pass: what reaches a row through the statistics is a line in its value.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        mean, variance = torch.batch_norm_update_stats(x.flatten(0, 2), None, None, 0.0)
+        best, index = functional.max_pool2d(
+            rearrange(x, "b m k c -> b c m k"), (1, x.shape[2]), return_indices=True
+        )
+        ctx.save_for_backward(x, mean, index)
+        return rearrange(best, "b c m 1 -> b m c"), mean, variance
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        x, mean, index = ctx.saved_tensors
+        to_best, to_mean, to_variance = gradients
+        count = x.shape[:-1].numel()
+        slope = 2 / count * to_variance
+        gradient = torch.addcmul(to_mean / count - slope * mean, x, slope)
+        rows = rearrange(index, "b c m 1 -> b m c")  # counted through a sample's neighbourhoods
+        gradient.flatten(1, 2).scatter_add_(1, rows, to_best)
+        return gradient
 
 
 def point_norm(norm: Norm, channels: int) -> nn.Module:
@@ -97,9 +149,21 @@ class SetAbstraction(nn.Module):
     ) -> Float[Tensor, "b m e"]:
         """Features of the first `m` points from those of `n`; `xyz` may go on after these."""
         count = near.shape[1]
-        offsets = (gathered(xyz, near) - xyz[:, :count, None]) / self.radius
-        said = self.neighbours(gathered(self.lift(features), near) + self.offset(offsets))
-        return functional.relu(self.norm(strongest(said) + self.skip(features[:, :count])))
+        with torch.autocast(xyz.device.type, enabled=False):  # differences of large numbers
+            places = self.offset(xyz[:, : features.shape[1]] / self.radius)
+        lifted = self.lift(features)
+        # Added, not subtracted: the way back would negate every neighbour's gradient.
+        joined = gathered(lifted + places, near) + -places[:, :count, None]
+        hidden = self.neighbours[:-2](joined.flatten(0, 2).to(lifted.dtype))
+        said = self._strongest(hidden.unflatten(0, near.shape)) + self.skip(features[:, :count])
+        return functional.relu(self.norm(said))
+
+    def _strongest(self, hidden: Float[Tensor, "b m k c"]) -> Float[Tensor, "b m e"]:
+        """Maximum over the neighbours of the last layer, normalised."""
+        last, norm = self.neighbours[-2], self.neighbours[-1]
+        if isinstance(norm, PerRow):
+            return norm.strongest(hidden, last.get_parameter("weight"))
+        return strongest(last(hidden))
 
 
 class FeaturePropagation(nn.Module):

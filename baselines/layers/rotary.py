@@ -9,10 +9,11 @@ near-sighted ones (D-act3d-heads).
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Complex64, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,13 +22,8 @@ from baselines.layers.attention import attend, linear
 SPAN = 10_000
 """Ratio of the fastest to the slowest angle."""
 
-
-@dataclass(frozen=True)
-class Turns:
-    """Cosine and sine by which each pair of channels is turned at each point."""
-
-    cos: Float[Tensor, "b n pairs"]
-    sin: Float[Tensor, "b n pairs"]
+Turns: TypeAlias = Complex64[Tensor, "b n pairs"]
+"""Numbers of length 1 by whose angles each pair of channels is turned at each point."""
 
 
 def turns(points_m: Float[Tensor, "b n 3"], width: int, rad_per_m: float) -> Turns:
@@ -35,16 +31,22 @@ def turns(points_m: Float[Tensor, "b n 3"], width: int, rad_per_m: float) -> Tur
     triples = width // 6
     falling = SPAN ** (-torch.arange(triples, device=points_m.device) / triples)
     angles = (points_m.float()[..., None, :] * (rad_per_m * falling)[:, None]).flatten(-2)
-    return Turns(angles.cos(), angles.sin())
+    return torch.complex(angles.cos(), angles.sin())
 
 
 def turned(x: Float[Tensor, "b n d"], code: Turns | None) -> Float[Tensor, "b n d"]:
-    """Turn the pairs (i, i + d/2) of `x`; without a code leave them as they are."""
+    """Turn the pairs (2i, 2i + 1) of `x`; without a code leave them as they are."""
     if code is None:
         return x
-    first, second = x.chunk(2, dim=-1)
-    whole = [first * code.cos - second * code.sin, first * code.sin + second * code.cos]
-    return torch.cat(whole, dim=-1).to(x.dtype)
+    # As complex numbers: one pass over memory, and one on the way back.
+    pairs = torch.view_as_complex(x.float().unflatten(-1, (-1, 2)))
+    return torch.view_as_real(pairs * code).flatten(-2).to(x.dtype)
+
+
+def in_pairs(parameter: Float[Tensor, "d *e"]) -> Float[Tensor, "d *e"]:
+    """Weights or biases in the order that `turned` wants: layers keep the first numbers of all
+    pairs before the second ones (i, i + d/2)."""
+    return rearrange(parameter, "(two p) ... -> (p two) ...", two=2)
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,17 @@ class Context:
 
     bias: Float[Tensor, "b 1 1 t"]
     """Added to attention scores; see `layers.padding_bias`."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A context as one block reads it."""
+
+    keys: Float[Tensor, "b t d"]
+    """Turned."""
+
+    values: Float[Tensor, "b t d"]
+    bias: Float[Tensor, "b 1 1 t"]
 
 
 class RelativeAttention(nn.Module):
@@ -73,18 +86,14 @@ class RelativeAttention(nn.Module):
         nn.init.zeros_(self.to_out.bias)
 
     def forward(
-        self, x: Float[Tensor, "b q d"], code: Turns | None, context: Context
+        self, x: Float[Tensor, "b q d"], code: Turns | None, memory: Memory
     ) -> Float[Tensor, "b q d"]:
-        """What each token of `x` reads of `context`."""
-        q = self._pairs(turned(self.to_q(x), code))
-        k = self._pairs(turned(self.to_k(context.tokens), context.code))
-        v = rearrange(self.to_v(context.tokens), "b t (h d) -> b h t d", h=self.heads)
-        read = attend(q, k, v, bias=context.bias)
+        """What each token of `x` reads of the memory."""
+        q = functional.linear(x, in_pairs(self.to_q.weight), in_pairs(self.to_q.bias))
+        parts = (turned(q, code), memory.keys, memory.values)
+        q, k, v = (rearrange(y, "b n (h d) -> b h n d", h=self.heads) for y in parts)
+        read = attend(q, k, v, bias=memory.bias)
         return self.to_out(rearrange(read, "b h q d -> b q (h d)"))
-
-    def _pairs(self, x: Float[Tensor, "b n d"]) -> Float[Tensor, "b h n _"]:
-        """Heads made of neighbouring pairs."""
-        return rearrange(x, "b n (two h p) -> b h n (two p)", two=2, h=self.heads)
 
 
 class RelativeBlock(nn.Module):
@@ -100,10 +109,10 @@ class RelativeBlock(nn.Module):
         self.norm_out = nn.LayerNorm(width)
 
     def forward(
-        self, x: Float[Tensor, "b q d"], code: Turns | None, context: Context
+        self, x: Float[Tensor, "b q d"], code: Turns | None, memory: Memory
     ) -> Float[Tensor, "b q d"]:
-        """Update the tokens of `x` from the context."""
-        x = self.norm_read(x + self.attention(x, code, context))
+        """Update the tokens of `x` from the memory."""
+        x = self.norm_read(x + self.attention(x, code, memory))
         return self.norm_out(x + self.fall(functional.relu(self.rise(x))))
 
 
@@ -119,6 +128,18 @@ class Reader(nn.Module):
         self, x: Float[Tensor, "b q d"], code: Turns | None, context: Context
     ) -> Float[Tensor, "b q d"]:
         """Update the tokens of `x` from the context; they never see each other."""
-        for block in self.blocks:
-            x = block(x, code, context)
+        for block, memory in zip(self.blocks, self.memories(context), strict=True):
+            x = block(x, code, memory)
         return x
+
+    def memories(self, context: Context) -> list[Memory]:
+        """What each block reads. The context stays as it is, so one product makes all of it."""
+        attentions = [m for m in self.modules() if isinstance(m, RelativeAttention)]
+        weights = [w for a in attentions for w in (in_pairs(a.to_k.weight), a.to_v.weight)]
+        biases = [b for a in attentions for b in (in_pairs(a.to_k.bias), a.to_v.bias)]
+        parts = functional.linear(context.tokens, torch.cat(weights), torch.cat(biases))
+        keys_and_values = parts.chunk(2 * len(attentions), dim=-1)
+        return [
+            Memory(turned(keys, context.code), values, context.bias)
+            for keys, values in zip(keys_and_values[::2], keys_and_values[1::2], strict=True)
+        ]

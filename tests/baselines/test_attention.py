@@ -8,7 +8,14 @@ from torch.nn import functional
 
 from baselines.agent import Recipe
 from baselines.heatmap import target_heatmaps
-from baselines.layers.attention import BlockSizes, NormedLinear, SelfBlock, attend, padding_bias
+from baselines.layers.attention import (
+    BlockSizes,
+    FeedForward,
+    NormedLinear,
+    SelfBlock,
+    attend,
+    padding_bias,
+)
 from baselines.layers.heads import ActionHead, ActionLogits, action_loss, choose, read_at
 from baselines.layers.stems import (
     PatchDecoder,
@@ -31,9 +38,10 @@ def slow_attention(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.T
     return torch.einsum("b h q t, b h t d -> b h q d", scores.softmax(-1), v)
 
 
+@pytest.mark.parametrize("width", [8, 16, 30])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.bfloat16, 0.03)])
-def test_attention_is_softmax_of_products(dtype: torch.dtype, tolerance: float) -> None:
-    q, k, v = torch.randn(3, 2, 2, 7, 8).unbind()
+def test_attention_is_softmax_of_products(dtype: torch.dtype, tolerance: float, width: int) -> None:
+    q, k, v = torch.randn(3, 2, 2, 7, width).unbind()
     found = attend(q.to(dtype), k.to(dtype), v.to(dtype)).float()
     torch.testing.assert_close(found, slow_attention(q, k, v), rtol=0, atol=tolerance)
 
@@ -46,6 +54,19 @@ def test_padding_is_not_attended_to(dtype: torch.dtype) -> None:
     k[..., 5:, :] = 3.0
     v[..., 5:, :] = 99.0
     assert torch.equal(attend(q, k, v, bias=padding_bias(real)), found)
+
+
+def test_a_gate_passes_the_gradients_that_autograd_would() -> None:
+    torch.manual_seed(0)
+    layer, x = FeedForward(SIZES).double(), torch.randn(2, 3, 16, dtype=torch.float64)
+    x.requires_grad_()
+    inputs = [x, *layer.parameters()]
+    value, gate = layer.rise(x).chunk(2, dim=-1)
+    expected = layer.fall(value * functional.gelu(gate))
+    torch.testing.assert_close(layer(x), expected)
+    pairs = (torch.autograd.grad(out.square().sum(), inputs) for out in (layer(x), expected))
+    for one, other in zip(*pairs, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_dropout_acts_in_training_only() -> None:

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from baselines.layers.attention import padding_bias
-from baselines.layers.rotary import Context, Reader, RelativeAttention, turned, turns
+from baselines.layers.rotary import Context, Reader, turned, turns
 
 WIDTH, HEADS, RATE = 48, 4, 30.0
 
@@ -32,12 +32,12 @@ def test_a_product_depends_on_the_displacement_alone() -> None:
     plain = q @ k.transpose(-1, -2)
     assert (products(shift) - plain).abs().max() > 1
     torch.testing.assert_close(turned(q, codes := turns(at, WIDTH, RATE)).norm(), q.norm())
-    assert codes.cos.shape == (1, 5, WIDTH // 2)
+    assert codes.shape == (1, 5, WIDTH // 2)
 
 
 def test_the_fastest_angle_is_the_rate() -> None:
     code = turns(torch.tensor([[[0.02, 0.0, 0.0]]]), WIDTH, RATE)
-    angles = torch.atan2(code.sin, code.cos)[0, 0]
+    angles = code.angle()[0, 0]
     assert angles[0] == pytest.approx(0.02 * RATE)
     assert angles[1] == angles[2] == 0  # y and z
     assert (angles[0::3].diff() < 0).all()
@@ -45,7 +45,8 @@ def test_the_fastest_angle_is_the_rate() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_every_head_sees_every_axis(axis: int) -> None:
-    attention = RelativeAttention(WIDTH, HEADS)
+    reader = Reader(WIDTH, HEADS, blocks=1)
+    attention = reader.blocks[0].attention
     attention.to_out = torch.nn.Identity()
     x, tokens = torch.randn(1, 1, WIDTH), torch.randn(1, 6, WIDTH)
     points = torch.rand(1, 6, 3)
@@ -53,8 +54,8 @@ def test_every_head_sees_every_axis(axis: int) -> None:
     moved[0, 0, axis] += 10.0  # far enough for the slowest pairs to notice
     code = turns(torch.zeros(1, 1, 3), WIDTH, RATE)
     with torch.no_grad():
-        before = attention(x, code, context(tokens, points))
-        after = attention(x, code, context(tokens, moved))
+        before = attention(x, code, *reader.memories(context(tokens, points)))
+        after = attention(x, code, *reader.memories(context(tokens, moved)))
     changes = (after - before).unflatten(-1, (HEADS, -1)).abs().amax(dim=-1)
     assert (changes > 1e-4).all()
 
@@ -83,3 +84,32 @@ def test_padding_is_not_read() -> None:
             for t in (tokens, loud)
         ]
     assert torch.equal(*answers)
+
+
+def slow_turned(x: Tensor, code: Tensor) -> Tensor:
+    """Channels i and i + d/2 as a plane."""
+    first, second = x.chunk(2, dim=-1)
+    cos, sin = code.real, code.imag
+    return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+
+
+def test_a_reader_is_its_blocks_one_after_the_other() -> None:
+    reader, x = Reader(WIDTH, HEADS, blocks=2), torch.randn(2, 3, WIDTH)
+    read = context(torch.randn(2, 6, WIDTH), torch.rand(2, 6, 3))
+    code = turns(torch.rand(2, 3, 3), WIDTH, RATE)
+    expected = x
+    for block in reader.blocks:
+        layers = block.attention
+        q, k = (
+            slow_turned(layer(tokens), turn).unflatten(-1, (2, HEADS, -1))
+            for layer, tokens, turn in (
+                (layers.to_q, expected, code),
+                (layers.to_k, read.tokens, read.code),
+            )
+        )
+        scores = torch.einsum("b q z h p, b t z h p -> b h q t", q, k) / (WIDTH / HEADS) ** 0.5
+        values = layers.to_v(read.tokens).unflatten(-1, (HEADS, -1))
+        heard = torch.einsum("b h q t, b t h d -> b q h d", scores.softmax(-1), values)
+        expected = block.norm_read(expected + layers.to_out(heard.flatten(-2)))
+        expected = block.norm_out(expected + block.fall(block.rise(expected).relu()))
+    torch.testing.assert_close(reader(x, code, read), expected)
