@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 
 from baselines.checkpoint import released_folder, sha256
+from leaderboard import tables
 from leaderboard.protocol import protocol_of
 from leaderboard.records import EPISODES_FILE, EpisodeRecord, read_records
 from leaderboard.summary import write_summary
+from leaderboard.tables import TablesConfig
+from sacil_tasks.catalog import suite_tasks
 from sacil_tasks.sizes import LABELS
 
 ROOT = Path(__file__).parents[2]
@@ -89,6 +92,32 @@ def table() -> Iterator[str]:
     for task, split in dict.fromkeys(key[:2] for key in cells):
         shown = " | ".join(cells.get((task, split, agent), "") for agent in AGENTS)
         yield f"| {task} | {split} | {shown} |"
+
+
+def test_the_tables_are_what_the_runs_come_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    tables.main(TablesConfig(runs=(Path("results"),), samples=40_000, out=tmp_path))
+    for made in tmp_path.iterdir():
+        assert made.read_bytes() == (RESULTS / made.name).read_bytes(), made.name
+
+
+def test_readme_has_table_1():
+    readme = (ROOT / "README.md").read_text()
+    for line in table_1():
+        assert line in readme, "paste:\n" + "\n".join(table_1())
+
+
+def table_1() -> Iterator[str]:
+    """Rows of README's table: successes of each network by task, and what its training took."""
+    with (RESULTS / "table1_single.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["core_minutes"]]
+    for row in rows:
+        tasks = " | ".join(
+            f"{row[f'{task}_successes']}/{row[f'{task}_episodes']}"
+            for task in suite_tasks("single")
+        )
+        average = f"{row['average']} ({row['average_low']}-{row['average_high']})"
+        yield f"| {row['model']} | {average} | {tasks} | {row['core_minutes']} |"
 
 
 def test_readme_has_the_experts_table():
