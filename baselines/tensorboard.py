@@ -3,6 +3,7 @@
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ EVENTS = "events"
 """Folder of event files in that of a run."""
 
 
-def event_log(folder: Path, *, after_step: int) -> Callable[[Mapping[str, Any]], None]:
-    """What writes rows of metrics into a run's event files.
+@contextmanager
+def event_log(folder: Path, *, after_step: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """What writes rows of metrics into a run's event files, within a few seconds or at the end.
 
     Raises:
         UsageError: tensorboardX is not installed.
@@ -26,14 +28,16 @@ def event_log(folder: Path, *, after_step: int) -> Callable[[Mapping[str, Any]],
             "metrics.jsonl has the same numbers, and `python -m baselines.plot` draws them."
         ) from error
     # A resumed run logs again what came after its last save: events from there on are hidden.
-    writer = SummaryWriter(str(folder / EVENTS), purge_step=after_step + 1)
+    writer = SummaryWriter(str(folder / EVENTS), purge_step=after_step + 1, flush_secs=5)
 
     def write(row: Mapping[str, Any]) -> None:
         for name, value in _scalars(row["kind"], row):
             writer.add_scalar(name, value, row["step"])
-        writer.flush()
 
-    return write
+    try:
+        yield write
+    finally:
+        writer.close()
 
 
 def _scalars(name: str, value: Any) -> Iterator[tuple[str, float]]:

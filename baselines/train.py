@@ -10,7 +10,7 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -58,10 +58,13 @@ def main(job: Job) -> None:
             return
     material = Material.load(job)
     wait_for_all()  # no rank may take what another begins for an earlier run
-    with sole_writer(options.folder) if rank() == 0 else nullcontext():
+    with ExitStack() as stack:
+        if rank() == 0:
+            stack.enter_context(sole_writer(options.folder))
         run = _begin(material) if state is None else _continue(material, state)
         if options.tensorboard and rank() == 0:
-            run.listeners.append(event_log(options.folder, after_step=run.trainer.step))
+            log = event_log(options.folder, after_step=run.trainer.step)
+            run.listeners.append(stack.enter_context(log))
         run.finish(validate_every=options.validate_every)
     if rank() == 0:
         _report(options.folder)
