@@ -160,6 +160,21 @@ class AgentSpec:
             return config
         return self.variants[find_name(variant, self.variants, f"variant of {self.name}")](config)
 
+    def check_variant(self, variant: str | None, config: Any) -> None:
+        """Refuse a config that is not what the variant's name says.
+
+        Raises:
+            UsageError: no such variant, or one of the fields that it sets has another value.
+        """
+        if variant is None:
+            return
+        change = self.variants[find_name(variant, self.variants, f"variant of {self.name}")]
+        if change(config) != config:
+            raise UsageError(
+                f"the config given is not that of {self.name}:{variant}, which is "
+                f"{change(config)}. Leave its fields alone, or take the agent without a variant."
+            )
+
 
 @cache
 def agent_modules() -> dict[str, str]:

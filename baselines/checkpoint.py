@@ -84,7 +84,9 @@ class Identity:
             )
         spec, _ = find_agent(str(content.get("agent")))
         kinds = {"config": type(next(iter(spec.presets.values())))}
-        return restore(cls, content, str(folder / CONFIG), kinds)
+        identity = restore(cls, content, str(folder / CONFIG), kinds)
+        spec.check_variant(identity.variant, identity.config)
+        return identity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,22 +183,31 @@ class TrainState:
         return cls(tensors=tensors, plan=plan, **progress)
 
 
+def trained_samples(folder: Path) -> int:
+    """Samples that the weights in `folder` have seen; 0 where there are none, or untrained ones."""
+    if not (folder / MODEL).is_file() or not (folder / PROVENANCE).is_file():
+        return 0
+    return int(_read_json(folder / PROVENANCE).get("samples") or 0)
+
+
 def export_release(run: Path, target: Path) -> None:
     """Copy the checkpoint of a finished run in half precision, without its training state.
 
     Raises:
-        UsageError: `run` holds no finished checkpoint, or `target` cannot be written.
+        UsageError: `run` holds no finished checkpoint, or one that does not load; nothing has been
+            written then. Or `target` cannot be written.
     """
     identity = Identity.load(run)
-    if not _read_json(run / PROVENANCE).get("complete"):
+    if _read_json(run / PROVENANCE).get("complete") is not True:
         raise UsageError(f"the run in {run} is not finished. Complete it with --resume first.")
-    with _readable(run / MODEL):
-        weights = load_file(run / MODEL)
+    weights = load(run, agent=identity.name).network.state_dict()
+    halves = {n: t.half() if t.is_floating_point() else t for n, t in weights.items()}
+    if not all(bool(half.isfinite().all()) for half in halves.values()):
+        raise UsageError(f"weights in {run} are too large for half precision. Train again.")
     identity.save(target)
     for name in (TEXT, PROVENANCE):
-        with _readable(run / name), atomic_path(target / name) as draft:
+        with atomic_path(target / name) as draft:
             shutil.copyfile(run / name, draft)
-    halves = {n: t.half() if t.is_floating_point() else t for n, t in weights.items()}
     save_weights(target, halves)
 
 

@@ -1,6 +1,7 @@
 """The command line of training: shared flags first, then every field of the agent's config."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import tyro
 
 from baselines.agent import find_agent
 from baselines.distributed import Device
+from baselines.tensorboard import require_tensorboard
 from sacil_tasks.catalog import suite_tasks, task_names
 from sacil_tasks.errors import UsageError, find_name
 
@@ -82,10 +84,14 @@ class TrainConfig:
         budgets = [self.minutes, self.steps, self.samples]
         if sum(budget is not None for budget in budgets) > 1:
             raise UsageError("--minutes, --steps and --samples exclude each other; give one.")
-        if any(budget is not None and budget <= 0 for budget in budgets):
-            raise UsageError("--minutes, --steps and --samples must be above 0.")
+        if any(budget is not None and not 0 < budget < math.inf for budget in budgets):
+            raise UsageError("--minutes, --steps and --samples must be above 0, and finite.")
         if self.threads < 1 or self.seed < 0 or self.validate_every < 0:
             raise UsageError("--threads must be above 0, --seed and --validate-every not below 0.")
+        if self.seed >= 2**63:
+            raise UsageError(f"--seed must be below 2^63, not {self.seed}.")
+        if self.tensorboard:
+            require_tensorboard()
         if self.suite is not None and self.tasks:
             raise UsageError("--suite and --tasks exclude each other; give one.")
 
@@ -144,6 +150,7 @@ def parse(args: Sequence[str]) -> Job:
         frozen=True,
     )
     command: Any = tyro.cli(job, args=args, description=ABOUT)
+    spec.check_variant(variant, command.config)
     return Job(command.options, with_samples(command.config, command.options.samples))
 
 

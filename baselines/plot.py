@@ -58,7 +58,10 @@ def main(config: PlotConfig) -> None:
     Raises:
         UsageError: a folder holds no run, or the picture cannot be written.
     """
-    curves = {folder.name: read_metrics(folder) for folder in config.runs}
+    names = [folder.name for folder in config.runs]
+    # Folders of one name are told apart by their whole paths.
+    labels = {f: f.name if names.count(f.name) == 1 else str(f) for f in config.runs}
+    curves = {label: read_metrics(folder) for folder, label in labels.items()}
     with atomic_path(config.out) as draft:
         draw(curves).savefig(draft, format="png", dpi=110)
     print(f"Written: {config.out}")

@@ -2,6 +2,7 @@
 `tensorboard --logdir runs/train`.
 """
 
+import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,20 +14,24 @@ EVENTS = "events"
 """Folder of event files in that of a run."""
 
 
-@contextmanager
-def event_log(folder: Path, *, after_step: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """What writes rows of metrics into a run's event files, within a few seconds or at the end.
+def require_tensorboard() -> None:
+    """Check that event files can be written.
 
     Raises:
         UsageError: tensorboardX is not installed.
     """
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError as error:
+    if importlib.util.find_spec("tensorboardX") is None:
         raise UsageError(
             "--tensorboard needs the package tensorboardX. Install it, or leave the flag out: "
             "metrics.jsonl has the same numbers, and `python -m baselines.plot` draws them."
-        ) from error
+        )
+
+
+@contextmanager
+def event_log(folder: Path, *, after_step: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """What writes rows of metrics into a run's event files, within a few seconds or at the end."""
+    from tensorboardX import SummaryWriter  # optional: `require_tensorboard`
+
     # A resumed run logs again what came after its last save: events from there on are hidden.
     writer = SummaryWriter(str(folder / EVENTS), purge_step=after_step + 1, flush_secs=5)
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from baselines.checkpoint import METRICS, TEXT, TrainState
+from baselines.checkpoint import METRICS, STATE, TEXT, TrainState, trained_samples
 from baselines.distributed import of_first, process_group, rank, wait_for_all
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
@@ -50,17 +50,16 @@ def main(job: Job) -> None:
     """
     options = job.options
     torch.set_num_threads(options.threads)
-    state = TrainState.load(options.folder)
-    if state is not None:
-        _check_resumable(job, state)
-        if state.step == state.plan["steps"]:
-            print(f"nothing to do: {options.folder} is complete ({state.step} steps).")
-            return
+    if _is_complete(job, _earlier(job)):
+        return
     material = Material.load(job)
-    wait_for_all()  # no rank may take what another begins for an earlier run
     with ExitStack() as stack:
         if rank() == 0:
             stack.enter_context(sole_writer(options.folder))
+        state = _earlier(job)  # another process may have trained here meanwhile
+        wait_for_all()  # no rank may take what another begins for an earlier run
+        if _is_complete(job, state):
+            return
         run = _begin(material) if state is None else _continue(material, state)
         if options.tensorboard and rank() == 0:
             log = event_log(options.folder, after_step=run.trainer.step)
@@ -68,6 +67,31 @@ def main(job: Job) -> None:
         run.finish(validate_every=options.validate_every)
     if rank() == 0:
         _report(options.folder)
+
+
+def _earlier(job: Job) -> TrainState | None:
+    """What a run in the folder has saved, if the job is to complete that run.
+
+    Raises:
+        UsageError: it is another run, or weights are there without what completes them.
+    """
+    folder = job.options.folder
+    state = TrainState.load(folder)
+    if state is not None:
+        _check_resumable(job, state)
+    elif trained_samples(folder):
+        raise UsageError(
+            f"{folder} holds trained weights but no {STATE} to go on from. "
+            "Choose another --out, or move them away."
+        )
+    return state
+
+
+def _is_complete(job: Job, state: TrainState | None) -> bool:
+    complete = state is not None and state.step == state.plan["steps"]
+    if complete and rank() == 0:
+        print(f"nothing to do: {job.options.folder} is complete.")
+    return complete
 
 
 def _begin(material: Material) -> Run:

@@ -7,7 +7,7 @@ why, so that a missing number is never mistaken for a bad one.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import groupby
 from statistics import fmean
 
 from leaderboard.layout import EQUAL_COMPUTE, OTHER, PROBE, SUITES, Column, Layout, Row
@@ -216,18 +216,19 @@ def _by_task(scores: Iterable[Score]) -> dict[str, tuple[Score, ...]]:
     """One score for each task and training seed.
 
     Raises:
-        UsageError: two networks have the same seed.
+        UsageError: two networks have the same seed, be it on different tasks.
     """
     ordered = sorted(scores, key=lambda score: (score.task, _order(score.seed)))
-    by_task = {task: tuple(group) for task, group in groupby(ordered, key=lambda it: it.task)}
-    for task, group in by_task.items():
-        for one, two in pairwise(group):
-            if one.seed == two.seed:
-                raise UsageError(
-                    f"{one.folders[0]} and {two.folders[0]} hold {task} of two networks of "
-                    f"{one.agent} with the same training seed. Name one of them with --runs."
-                )
-    return by_task
+    first_of_seed: dict[int | None, Score] = {}
+    for two in ordered:
+        one = first_of_seed.setdefault(two.seed, two)
+        if (two.checkpoint, two.privileged) != (one.checkpoint, one.privileged):
+            raise UsageError(
+                f"{one.folders[0]} and {two.folders[0]} hold {one.task} and {two.task} of two "
+                f"networks of {one.agent} with the same training seed. Name one of them with "
+                "--runs."
+            )
+    return {task: tuple(group) for task, group in groupby(ordered, key=lambda it: it.task)}
 
 
 def _with_doubts(entrant: Entrant, most: Mapping[str, int]) -> Entrant:
@@ -237,6 +238,10 @@ def _with_doubts(entrant: Entrant, most: Mapping[str, int]) -> Entrant:
         fewest = min(len(score.records) for score in scores)
         if fewest < most[task]:
             doubts.append(f"{task}: {fewest} of {most[task]} episodes that others have")
+    seeds = {task: [score.seed for score in scores] for task, scores in entrant.scores.items()}
+    for task, found in seeds.items():
+        if len(found) < max(map(len, seeds.values())):
+            doubts.append(f"{task}: {len(found)} of several training seeds")
     records = [r for scores in entrant.scores.values() for s in scores for r in s.records.values()]
     if broken := sum(record.errored for record in records):
         doubts.append(f"{broken} episodes broke off and count as failures")

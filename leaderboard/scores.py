@@ -80,6 +80,7 @@ class Score:
             )
         if run.folder not in self.folders:
             self.folders.append(run.folder)
+            self.test_runs = max(self.test_runs, run.manifest.test_runs)
 
 
 def find_runs(places: Iterable[Path]) -> list[EvalRun]:

@@ -82,6 +82,7 @@ def main(config: TablesConfig) -> None:
     scope = _scope(config)
     runs = find_runs(config.runs or _existing(DEFAULT_RUNS))
     scores = _scores(runs, scope)
+    _check_budget(scores, config.samples)
     filled = fill(scores, scope, against=config.against, samples=config.samples)
     texts = _texts(filled, _suffix(scope)) | {"summary.csv": summary_text(_all_records(runs))}
     for name, text in texts.items():
@@ -145,6 +146,13 @@ def _scores(runs: Sequence[EvalRun], scope: Scope) -> list[Score]:
             f"split {scope.split}, scene set {scope.scene_set}."
         )
     return scores
+
+
+def _check_budget(scores: Sequence[Score], samples: int | None) -> None:
+    budgets = {score.training.samples for score in scores if score.training}
+    if samples is not None and samples not in budgets:
+        found = ", ".join(f"{budget:,}" for budget in sorted(budgets)) or "none"
+        raise UsageError(f"no run was trained on {samples:,} samples. Budgets found: {found}.")
 
 
 def _suffix(scope: Scope) -> str:

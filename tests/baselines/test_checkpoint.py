@@ -167,6 +167,29 @@ def test_a_release_is_half_as_large_and_loads_alone(folder, tmp_path):
         assert torch.equal(tensor, full[name].half().float())
 
 
+def test_a_run_that_does_not_load_replaces_no_release(folder, tmp_path):
+    target = tmp_path / "released"
+    checkpoint.export_release(folder, target)
+    before = {path.name: path.read_bytes() for path in target.iterdir()}
+    weights = load_file(folder / MODEL)
+    checkpoint.save_weights(folder, {name: tensor + 1e6 for name, tensor in weights.items()})
+    with pytest.raises(UsageError, match="too large for half precision"):
+        checkpoint.export_release(folder, target)
+    (folder / TEXT).unlink()
+    with pytest.raises(UsageError, match=TEXT):
+        checkpoint.export_release(folder, target)
+    assert before == {path.name: path.read_bytes() for path in target.iterdir()}
+
+
+def test_a_config_that_is_not_its_variants_is_refused(folder):
+    edit_config(folder, variant="goals")
+    with pytest.raises(UsageError, match="not that of tiny:goals"):
+        checkpoint.load(folder, agent="tiny:goals")
+    edit_config(folder, variant="../../x")
+    with pytest.raises(UsageError, match="variant of tiny"):
+        checkpoint.load(folder, agent="tiny")
+
+
 def test_an_unfinished_run_is_not_released(folder, tmp_path):
     (folder / PROVENANCE).write_text('{"complete": false}')
     with pytest.raises(UsageError, match="not finished"):
@@ -191,7 +214,9 @@ def test_a_variant_is_released_beside_its_agent(folder, tmp_path, monkeypatch):
         monkeypatch.setattr(module, "released_folder", lambda agent: tmp_path / agent)
     edit_config(folder, tasks=suite_tasks("slice"))
     release.main(ReleaseConfig(run=folder))
-    edit_config(folder, variant="goals")
+    config = json.loads((folder / CONFIG).read_text())["config"]
+    edit_config(folder, variant="goals", config=config | {"goals": True})
+    save_weights(folder, Identity.load(folder))
     release.main(ReleaseConfig(run=folder))
     for name, target in (("tiny", "slice"), ("tiny:goals", "slice.goals")):
         assert checkpoint.find_released(name, TASKS) == tmp_path / "tiny" / target

@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import synthetic
 import torch
 from tensorboardX.proto import event_pb2
 
-from baselines import agent, run, trainer
+from baselines import agent, material, run, trainer
 from baselines.checkpoint import CONFIG, METRICS, MODEL, PROVENANCE, STATE, TrainState, load
 from baselines.options import parse
 from baselines.run import Means, read_rows
@@ -184,6 +185,31 @@ def test_a_complete_run_has_nothing_to_do(data, unbroken, capsys):
     train(data, unbroken, "--resume", "--minutes", "1")
     assert "nothing to do" in capsys.readouterr().out
     assert (unbroken / STATE).stat().st_mtime_ns == before
+
+
+def test_trained_weights_without_a_state_are_not_overwritten(data, tmp_path, unbroken):
+    for name in (CONFIG, MODEL, PROVENANCE, METRICS):
+        shutil.copyfile(unbroken / name, tmp_path / name)
+    before = (tmp_path / MODEL).read_bytes()
+    for flags in ((), ("--resume",)):
+        with pytest.raises(UsageError, match="holds trained weights but no train_state"):
+            train(data, tmp_path, "--steps", "2", *flags)
+    assert (tmp_path / MODEL).read_bytes() == before
+    assert read_rows(tmp_path / METRICS)
+
+
+def test_a_run_that_another_process_finished_meanwhile_is_not_begun_anew(
+    data, tmp_path, unbroken, monkeypatch, capsys
+):
+    loads = material.Material.load
+
+    def load_slowly(job):
+        shutil.copytree(unbroken, tmp_path / "run")
+        return loads(job)
+
+    monkeypatch.setattr(material.Material, "load", load_slowly)
+    train(data, tmp_path / "run", "--validate-every", "4")
+    assert "nothing to do" in capsys.readouterr().out
 
 
 def test_an_unfinished_run_is_neither_overwritten_nor_changed(data, tmp_path, monkeypatch):

@@ -83,9 +83,6 @@ def test_two_budgets_of_the_agent_compared_with_must_be_chosen_from(runs):
     assert line["sacil"]["samples"] == "24000"
     assert line["rvt"]["note"].startswith("left out: 120,000 samples, not 24,000")
     assert rows(tabulate(runs, samples=120_000))["rvt"]["note"] == ""
-    line = rows(tabulate(runs, samples=7))["rvt"]
-    assert line["average"] == ""
-    assert "left out: 120,000 samples, and no row has the table's budget" in line["note"]
 
 
 def test_budgets_are_not_mixed_where_the_agent_compared_with_is_missing(tmp_path):
@@ -145,6 +142,28 @@ def test_two_networks_of_one_seed_are_refused(runs):
     play(runs / "twin", "sacil", training=twin)
     with pytest.raises(UsageError, match=r"sacil.*twin.*same training seed.*--runs"):
         tabulate(runs)
+
+
+def test_a_row_is_never_made_of_two_networks_by_task(tmp_path):
+    halves = (SUITES["single"][:2], SUITES["single"][2:])
+    for number, tasks in enumerate(halves):
+        training = make_training(core_minutes=60.0 + number)
+        play(tmp_path / "runs" / str(number), "sacil", tasks=tasks, training=training)
+    with pytest.raises(UsageError, match=r"two networks of sacil with the same training seed"):
+        tabulate(tmp_path / "runs")
+
+
+def test_tasks_with_fewer_training_seeds_than_others_are_named(runs):
+    play(runs / "more", "sacil", tasks=("place_cup",), training=make_training(seed=1))
+    note = rows(tabulate(runs))["sacil"]["note"]
+    assert "pick_and_lift: 1 of several training seeds" in note
+    assert "place_cup: " not in note
+
+
+def test_a_budget_that_no_run_has_is_refused_and_nothing_is_written(runs, tmp_path):
+    with pytest.raises(UsageError, match=r"no run was trained on 12,345 .*found: 120,000"):
+        main(TablesConfig(runs=(runs,), samples=12_345, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_copied_run_counts_once_and_one_that_disagrees_is_refused(runs):
