@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.configs import Fraction, Natural, Positive, Share, check_numbers
 from baselines.scene.augment import AugmentConfig
 from baselines.scene.sight import Sight
 from baselines.text import TextSpec
@@ -35,20 +36,20 @@ class Recipe:
     batch: int = 16
     """Samples of one step."""
 
-    choice_share: float | None = 0.6
+    choice_share: Share | None = 0.6
     """Share of samples that show a keyframe at which the words decide where to go: the first one
     of each candidate to be handled (D-choice-share); None draws all keyframes alike."""
 
-    lr: float = 6e-3
+    lr: Positive = 6e-3
     """Peak learning rate of LAMB; settled on `val` (RVT's rule for its own size: 1e-4 a sample)."""
 
-    warmup_steps: int = 200
+    warmup_steps: Natural = 200
     """Steps of linear warm-up before the cosine."""
 
     weight_decay: float = 1e-6
     """Decoupled weight decay on every tensor."""
 
-    ema_decay: float = 0.998
+    ema_decay: Fraction = 0.998
     """Decay of the weight average that is saved and evaluated; 0 takes the raw weights."""
 
     rotation_weight: float = 3.0
@@ -57,7 +58,7 @@ class Recipe:
     rotation_sigma_bins: float = 1.5
     """Width of the circular Gaussian over the 72 rotation bins; 0 gives one-hot labels."""
 
-    heatmap_sigma_px: float = 1.5
+    heatmap_sigma_px: Positive = 1.5
     """Width of the Gaussian over a view's pixels."""
 
     augment: AugmentConfig = field(default_factory=AugmentConfig)
@@ -78,6 +79,7 @@ class Recipe:
         Raises:
             UsageError: names the field, what it may be and what came.
         """
+        check_numbers(self)
         if self.batch < 2:
             raise UsageError(f"recipe.batch must be at least 2 (two sizes), not {self.batch}.")
         if self.samples < self.batch:
@@ -169,10 +171,11 @@ class AgentSpec:
         if variant is None:
             return
         change = self.variants[find_name(variant, self.variants, f"variant of {self.name}")]
-        if change(config) != config:
+        given, meant = vars(config), vars(change(config))
+        if wrong := [name for name in given if given[name] != meant[name]]:
             raise UsageError(
-                f"the config given is not that of {self.name}:{variant}, which is "
-                f"{change(config)}. Leave its fields alone, or take the agent without a variant."
+                f"{self.name}:{variant} means {', '.join(f'{n} {meant[n]}' for n in wrong)}, not "
+                f"{', '.join(str(given[n]) for n in wrong)}. Take the agent without its variant."
             )
 
 

@@ -1,14 +1,99 @@
-"""Config dataclasses back from the JSON of `dataclasses.asdict`, with every field checked."""
+"""Config dataclasses: what their numbers may be, and how they come back from the JSON of
+`dataclasses.asdict`, every field checked.
+"""
 
 import dataclasses
+import math
 import types
 import typing
-from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from sacil_tasks.errors import UsageError
 
 C = TypeVar("C")
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Which numbers a field may hold; all are finite."""
+
+    low: float
+    high: float = math.inf
+    above: bool = False
+    """The lowest itself is left out."""
+
+    below: bool = False
+    """The highest itself is left out."""
+
+    odd: bool = False
+
+    def __contains__(self, number: float) -> bool:
+        """Whether a field may hold it."""
+        if not math.isfinite(number) or (self.odd and number % 2 != 1):
+            return False
+        low = number > self.low if self.above else number >= self.low
+        return low and (number < self.high if self.below else number <= self.high)
+
+    def __str__(self) -> str:
+        """What a user may write."""
+        words = ["an odd number" if self.odd else "a finite number"]
+        words.append(f"{'above' if self.above else 'from'} {self.low:g}")
+        if math.isfinite(self.high):
+            words.append(f"{'below' if self.below else 'to'} {self.high:g}")
+        return " ".join(words)
+
+
+Natural: TypeAlias = Annotated[int, Range(0)]
+Odd: TypeAlias = Annotated[int, Range(1, odd=True)]
+Positive: TypeAlias = Annotated[float, Range(0, above=True)]
+Share: TypeAlias = Annotated[float, Range(0, 1)]
+Fraction: TypeAlias = Annotated[float, Range(0, 1, below=True)]
+
+
+def check_numbers(config: Any) -> None:
+    """Call in a config's `__post_init__`: numbers that make no network end here in one sentence.
+
+    A field that does not say otherwise holds, if an integer, a count from 1, and if a float, a
+    number that is not negative; tuples are not empty.
+
+    Raises:
+        UsageError: names the field, what it may be and what came.
+    """
+    hints = typing.get_type_hints(type(config), include_extras=True)
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        for number, allowed in _numbers(hints[field.name], value):
+            if number not in allowed:
+                raise UsageError(f"{field.name} must be {allowed}, not {value}.")
+        if value == () and not field.metadata.get("may_be_empty"):
+            raise UsageError(f"{field.name} must not be empty.")
+
+
+def _numbers(hint: Any, value: Any) -> Iterator[tuple[float, Range]]:
+    """The numbers in a field's value, each with its range."""
+    if typing.get_origin(hint) is Annotated:
+        yield value, next(it for it in hint.__metadata__ if isinstance(it, Range))
+    elif isinstance(value, tuple):
+        kinds = [kind for kind in _tuple_kinds(hint) if kind is not ...]
+        for index, part in enumerate(value):
+            yield from _numbers(kinds[min(index, len(kinds) - 1)], part)
+    elif isinstance(value, bool):
+        return
+    elif isinstance(value, int | float):
+        inner = [kind for kind in typing.get_args(hint) if typing.get_origin(kind) is Annotated]
+        if inner:
+            yield from _numbers(inner[0], value)
+        else:
+            yield value, Range(1 if hint is int else 0)
+
+
+def _tuple_kinds(hint: Any) -> tuple[Any, ...]:
+    """Types of the parts of a tuple's hint, or of the tuple in a union."""
+    if typing.get_origin(hint) is tuple:
+        return typing.get_args(hint)
+    (found,) = (it for it in typing.get_args(hint) if typing.get_origin(it) is tuple)
+    return typing.get_args(found)
 
 
 def restore(kind: type[C], values: Any, source: str, kinds: Mapping[str, type] | None = None) -> C:
@@ -55,6 +140,8 @@ def _fits(hint: Any, value: Any) -> bool:
             return False
         kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
         return len(kinds) == len(value) and all(map(_fits, kinds, value))
+    if isinstance(value, bool):
+        return hint in (bool, Any)
     if hint is float:
         return isinstance(value, int | float)
     return isinstance(value, hint) if isinstance(hint, type) else True

@@ -25,6 +25,7 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.configs import Natural, Odd, Positive, check_numbers
 from baselines.layers import ghosts
 from baselines.layers.attention import padding_bias
 from baselines.layers.multiview import trimmed_text
@@ -55,10 +56,10 @@ class Act3dConfig:
     clip_weights: str = ""
     """Safetensors file with CLIP's RN50, which then stays frozen; empty trains from scratch."""
 
-    levels: tuple[int, int] = (1, 0)
+    levels: tuple[Natural, Natural] = (1, 0)
     """Maps of the trunk, counted from the finest, that coarse and fine cells come from."""
 
-    output_kernel: int = 1
+    output_kernel: Odd = 1
     """Kernel of the pyramid's output convolutions."""
 
     embedding: int = 96
@@ -80,7 +81,7 @@ class Act3dConfig:
     fine_cells: int = 256
     """Fine cells that are read: those nearest to the guess."""
 
-    radii_m: tuple[float, ...] = (0.08, 0.02)
+    radii_m: tuple[Positive, ...] = (0.08, 0.02)
     """Radius of the ball of ghosts at each level after the first."""
 
     ghosts_learning: int = 128
@@ -89,7 +90,7 @@ class Act3dConfig:
     ghosts_acting: tuple[int, ...] = (2000, 1000, 1000)
     """Ghosts of each level when acting."""
 
-    label_spread_m: float = 0.01
+    label_spread_m: Positive = 0.01
     """Distance from the label at which a ghost's target falls by a factor e."""
 
     recipe: Recipe = field(
@@ -101,8 +102,17 @@ class Act3dConfig:
         """Check that the sizes fit each other.
 
         Raises:
-            UsageError: heads would split pairs, or a level lacks its ghosts or its ball.
+            UsageError: a number makes no network, heads would split pairs, a level lacks its map,
+                its ghosts or its ball, or weights are given that the trunk does not read.
         """
+        check_numbers(self)
+        if self.trunk == "small" and max(self.levels) >= len(self.trunk_channels):
+            raise UsageError(
+                f"--levels {self.levels} asks for more maps than the {len(self.trunk_channels)} of "
+                "--trunk-channels, which are counted from 0."
+            )
+        if self.trunk == "small" and self.clip_weights:
+            raise UsageError("--clip-weights need --trunk resnet50; the small one has none.")
         if self.embedding % (6 * self.heads):
             raise UsageError(
                 f"an embedding of {self.embedding} does not give each of {self.heads} heads a "

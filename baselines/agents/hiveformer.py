@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
+from baselines.configs import Fraction, Odd, check_numbers
 from baselines.layers.attention import attend, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
@@ -56,13 +57,13 @@ class HiveFormerConfig:
     past_gradients: bool = False
     """Whether the encoder also learns from what it shows of earlier steps (D-hiveformer-past)."""
 
-    stem: tuple[int, ...] = ()
+    stem: tuple[int, ...] = field(default=(), metadata={"may_be_empty": True})
     """Channels of the convolutions at full resolution."""
 
     channels: tuple[int, int, int, int] = (16, 16, 32, 64)
     """Channels at 1/2, 1/4, 1/8 and 1/16 of the resolution."""
 
-    fine_kernel: int = 1
+    fine_kernel: Odd = 1
     """Kernel of the decoder's convolution at half the resolution."""
 
     width: int = 128
@@ -80,7 +81,7 @@ class HiveFormerConfig:
     pose_channels: int = 64
     """Channels of the head for offset, rotation, gripper and collision."""
 
-    dropout: float = 0.0
+    dropout: Fraction = 0.0
     """Dropout on attention probabilities and on what each part adds to a token."""
 
     position_weight: float = 100.0
@@ -93,15 +94,14 @@ class HiveFormerConfig:
         """Check that the sizes fit each other.
 
         Raises:
-            UsageError: the heads do not share the width equally, or no step is seen.
+            UsageError: a number makes no network, or the heads do not share the width equally.
         """
+        check_numbers(self)
         if self.width % self.heads:
             raise UsageError(
                 f"a width of {self.width} cannot be shared by {self.heads} heads. "
                 "Choose --width as a multiple of --heads."
             )
-        if self.window < 1:
-            raise UsageError(f"--window counts the present step, so it is not {self.window}.")
 
     @property
     def grid(self) -> int:

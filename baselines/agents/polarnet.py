@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
+from baselines.configs import Fraction, Positive, check_numbers
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
@@ -44,7 +45,7 @@ HEAT_REACH_M = 0.01
 class PolarNetConfig:
     """Sizes of PolarNet; the defaults are the `cpu` preset (D-polarnet-cpu)."""
 
-    voxel_m: float = 0.005
+    voxel_m: Positive = 0.005
     """Edge of the cells in which points are averaged (D-polarnet-voxel)."""
 
     points: int = 2048
@@ -55,7 +56,7 @@ class PolarNetConfig:
     stages: tuple[int, ...] = (512, 256, 128, 64)
     """Points that each stage of the encoder keeps."""
 
-    radius: float = 0.05
+    radius: Positive = 0.05
     """Reach of the first stage's neighbourhoods, in units of the cloud's; 2.5 times as far with
     each stage."""
 
@@ -80,7 +81,7 @@ class PolarNetConfig:
     layers: int = 1
     """Layers of the transformer."""
 
-    dropout: float = 0.0
+    dropout: Fraction = 0.0
     """Dropout in the transformer."""
 
     heat_weight: float = 1.0
@@ -97,9 +98,10 @@ class PolarNetConfig:
         """Check that the sizes fit each other.
 
         Raises:
-            UsageError: a stage keeps more points than there are, or the heads do not share the
-                width equally.
+            UsageError: a number makes no network, a stage keeps more points than there are, or the
+                heads do not share the width equally.
         """
+        check_numbers(self)
         if self.width % self.heads:
             raise UsageError(
                 f"a width of {self.width} cannot be shared by {self.heads} heads. "

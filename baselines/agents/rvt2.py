@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from einops import rearrange
@@ -27,6 +27,7 @@ from torch.nn import functional
 from baselines.agent import AgentSpec, Network
 from baselines.agents.rvt import PAPER_RECIPE, Read, RvtConfig, Transformer
 from baselines.batch import Batch, Inputs, Labels, Prediction
+from baselines.configs import Odd, Range
 from baselines.heatmap import decode, target_heatmaps
 from baselines.layers.attention import init_leaky, linear, mlp
 from baselines.layers.heads import ActionLogits, choose_at, loss_of_maps
@@ -58,13 +59,13 @@ class Rvt2Config(RvtConfig):
 
     views: ClassVar[tuple[View, ...]] = THREE_VIEWS
 
-    zoom: float = 4.0
+    zoom: Annotated[float, Range(1)] = 4.0
     """How much larger the fine stage sees the scene."""
 
     stray: float = 0.1
     """How far from the label the zoom may be centred in training, along each axis of the cube."""
 
-    upsample_kernel: int = 3
+    upsample_kernel: Odd = 3
     """Kernel of the decoder's convolutions over tokens."""
 
     convex_channels: int = 32

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from baselines.agent import Recipe
 from baselines.batch import Inputs
+from baselines.configs import Fraction, Odd, check_numbers
 from baselines.layers.attention import BlockSizes, SelfBlock, linear
 from baselines.layers.heads import ActionHead, ActionLogits
 from baselines.layers.stems import (
@@ -50,7 +51,7 @@ class MultiViewConfig:
     stem_channels: int = 64
     """Channels of the stem's token map (and of the full-resolution skip of `patch`)."""
 
-    upsample_kernel: int = 5
+    upsample_kernel: Odd = 5
     """Kernel of the two large convolutions of the `patch` stem's decoder."""
 
     lowered_channels: int = 64
@@ -71,7 +72,7 @@ class MultiViewConfig:
     hidden: int = 192
     """Hidden units of the gated feed-forward layers."""
 
-    dropout: float = 0.0
+    dropout: Fraction = 0.0
     """Dropout on attention probabilities."""
 
     recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16"))
@@ -81,8 +82,10 @@ class MultiViewConfig:
         """Check that the sizes fit each other.
 
         Raises:
-            UsageError: views are not a whole number of patches, or the pyramid ends elsewhere.
+            UsageError: a number makes no network, views are not a whole number of patches, or the
+                pyramid ends elsewhere.
         """
+        check_numbers(self)
         if self.pixels % self.patch:
             raise UsageError(
                 f"views of {self.pixels} pixels cannot be cut into patches of {self.patch}. "

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from baselines.configs import check_numbers
 from baselines.rotation import multiply
 from baselines.scene.views import apply_affine, cube_from_base
 from sacil_tasks.interface import SCENE_BOUNDS, SceneBounds
@@ -26,6 +27,14 @@ class AugmentConfig:
     """Largest shift to either side, along each axis or along all of them. The table is equally high
     in all scenes, so that the height of an object's top tells its size, unless shifts up and down
     hide it (D-heights; the paper shifts along all axes)."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            UsageError: one of them is negative or not finite.
+        """
+        check_numbers(self)
 
 
 @dataclass(frozen=True)

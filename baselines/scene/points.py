@@ -75,11 +75,6 @@ class Pyramid:
         Raises:
             UsageError: a stage keeps more points than there are.
         """
-        if self.neighbours < 1 or not self.stages or not self.voxel_m > 0:
-            raise UsageError(
-                "a pyramid needs --stages, --neighbours above 0 and --voxel-m above 0, not "
-                f"{self.stages}, {self.neighbours} and {self.voxel_m}."
-            )
         counts = (self.points, *self.stages)
         if list(counts) != sorted(counts, reverse=True) or counts[-1] < 1:
             raise UsageError(

@@ -24,6 +24,7 @@ from torch.nn import functional
 from baselines.agent import AgentSpec, Network
 from baselines.agents.rvt import PAPER_RECIPE
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.configs import Natural
 from baselines.layers.attention import NormedLinear, linear, mlp, padding_bias
 from baselines.layers.heads import ActionLogits, action_loss, choose
 from baselines.layers.multiview import (
@@ -50,7 +51,7 @@ from sacil_agent.sadq import Read, SizeAwareQueries
 class SacilConfig(MultiViewConfig):
     """Sizes of SACIL; the defaults are the `cpu` preset."""
 
-    queries: int = 5
+    queries: Natural = 5
     """Size-aware query tokens (section 3.4); 0 contrasts the mean visual token instead."""
 
     instruction_enters: Literal["after_contrast", "before_contrast"] = "after_contrast"

@@ -183,7 +183,7 @@ def test_a_run_that_does_not_load_replaces_no_release(folder, tmp_path):
 
 def test_a_config_that_is_not_its_variants_is_refused(folder):
     edit_config(folder, variant="goals")
-    with pytest.raises(UsageError, match="not that of tiny:goals"):
+    with pytest.raises(UsageError, match="tiny:goals means goals True, not False"):
         checkpoint.load(folder, agent="tiny:goals")
     edit_config(folder, variant="../../x")
     with pytest.raises(UsageError, match="variant of tiny"):
