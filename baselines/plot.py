@@ -58,20 +58,30 @@ def main(config: PlotConfig) -> None:
     Raises:
         UsageError: a folder holds no run, or the picture cannot be written.
     """
-    names = [folder.name for folder in config.runs]
-    # Folders of one name are told apart by their whole paths.
-    labels = {f: f.name if names.count(f.name) == 1 else str(f) for f in config.runs}
-    curves = {label: read_metrics(folder) for folder, label in labels.items()}
+    curves = read_runs(config.runs)
     with atomic_path(config.out) as draft:
         draw(curves).savefig(draft, format="png", dpi=110)
     print(f"Written: {config.out}")
+
+
+def read_runs(folders: Sequence[Path]) -> dict[str, list[Row]]:
+    """The metrics of each run under its folder's name, or whole path where names are shared.
+
+    Raises:
+        UsageError: as `read_metrics`.
+    """
+    names = [folder.name for folder in folders]
+    return {
+        folder.name if names.count(folder.name) == 1 else str(folder): read_metrics(folder)
+        for folder in folders
+    }
 
 
 def read_metrics(folder: Path) -> list[Row]:
     """The rows of a run's metrics with their time as `core_min`, oldest first.
 
     Raises:
-        UsageError: there are none.
+        UsageError: there are none, or none of training.
     """
     rows = read_rows(folder / METRICS)
     if not rows:
@@ -81,6 +91,8 @@ def read_metrics(folder: Path) -> list[Row]:
         )
     # A validation has the time of the training row of its step.
     minutes = {row["step"]: row["cpu_s"] / 60 for row in rows if row["kind"] == "train"}
+    if not minutes:
+        raise UsageError(f"{folder} has no line of training yet. Try again a little later.")
     return [{**row, "core_min": minutes[row["step"]]} for row in rows if row["step"] in minutes]
 
 

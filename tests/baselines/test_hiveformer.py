@@ -204,6 +204,7 @@ def test_edges_are_continued() -> None:
 
 
 @pytest.mark.parametrize(
+    ("change", "words"), [({"heads": 3}, "multiple of --heads"), ({"window": 0}, "window must be")]
 )
 def test_sizes_that_do_not_fit_are_refused(change: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from baselines.plot import PlotConfig, draw, main, read_metrics
+from baselines.plot import PlotConfig, draw, main, read_metrics, read_runs
 from sacil_tasks.errors import UsageError
 
 
@@ -29,6 +29,20 @@ def test_runs_are_drawn_over_core_minutes_where_they_have_values(tmp_path):
     contrast = by_title["Image-Text Contrast"].lines
     assert [len(line.get_xydata()) for line in contrast] == [0, 2], "rvt has no contrast"
     assert "Current-Goal Contrast" not in by_title
+
+
+def test_runs_of_one_name_are_told_apart(tmp_path):
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+    runs = [write_run(tmp_path / place, "rvt", contrast=False) for place in ("a", "b")]
+    assert set(read_runs(runs)) == {str(run) for run in runs}
+
+
+def test_a_run_that_has_only_been_validated_is_named(tmp_path):
+    row = {"kind": "val", "step": 2, "all": {"selected_by_words": [3, 4], "position_mm": 5}}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+    with pytest.raises(UsageError, match="no line of training yet"):
+        main(PlotConfig(runs=(tmp_path,), out=tmp_path / "curves.png"))
 
 
 def test_the_picture_is_written(tmp_path):
