@@ -8,7 +8,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeAlias
@@ -16,14 +16,16 @@ from typing import Any, TypeAlias
 import torch
 from tqdm import tqdm
 
-from baselines.agent import Network
+from baselines.agent import Network, find_agent
 from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
 from baselines.distributed import anywhere, averaged, device_name, rank, ranks, wait_for_all
 from baselines.trainer import Trainer
 from sacil_tasks.errors import UsageError
-from sacil_tasks.files import atomic_path, code_version, unwritable, write_json
+from sacil_tasks.files import atomic_path, code_version, content_hash, unwritable, write_json
 
 log = logging.getLogger(__name__)
+
+HASH_LENGTH = 8
 
 LOG_EVERY = 50
 """Steps of one line of `metrics.jsonl`."""
@@ -161,7 +163,7 @@ class Run:
         trainer, request = self.trainer, self.plan["request"]
         return {
             "agent": request["agent"],
-            "preset": request["preset"],
+            "preset": preset_name(request),
             "seed": request["seed"],
             "text": request["config"]["recipe"]["text"],
             "steps": trainer.step,
@@ -203,6 +205,19 @@ class Run:
         append_row(self.folder / METRICS, row)
         for listener in self.listeners:
             listener(row)
+
+
+def preset_name(request: Mapping[str, Any]) -> str:
+    """The preset of a run; where flags have changed its config, with that config's hash behind it.
+
+    Tables put runs of one preset side by side and pool their seeds.
+    """
+    spec, variant = find_agent(request["agent"])
+    config = asdict(spec.config(request["preset"], variant))
+    del config["recipe"]["samples"]  # the budget is told apart
+    if json.loads(json.dumps(config)) == request["config"]:
+        return request["preset"]
+    return f"{request['preset']}+{content_hash(request['config'])[:HASH_LENGTH]}"
 
 
 def append_row(path: Path, row: Row) -> None:

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -185,6 +186,16 @@ def test_a_complete_run_has_nothing_to_do(data, unbroken, capsys):
     train(data, unbroken, "--resume", "--minutes", "1")
     assert "nothing to do" in capsys.readouterr().out
     assert (unbroken / STATE).stat().st_mtime_ns == before
+
+
+def test_provenance_tells_a_changed_config_from_the_preset(data, tmp_path):
+    presets = []
+    for number, flags in enumerate([(), ("--seed", "1"), ("--recipe.lr", "0.001")]):
+        train(data, tmp_path / str(number), "--steps", "1", "--validate-every", "0", *flags)
+        provenance = json.loads((tmp_path / str(number) / PROVENANCE).read_text())
+        presets.append(provenance["preset"])
+    assert presets[:2] == ["cpu", "cpu"]
+    assert re.fullmatch(r"cpu\+[0-9a-f]{8}", presets[2])
 
 
 def test_trained_weights_without_a_state_are_not_overwritten(data, tmp_path, unbroken):
