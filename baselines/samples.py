@@ -45,7 +45,9 @@ class Sample(NamedTuple):
 class Shard:
     """One task's keyframe file in memory."""
 
-    task: str
+    origin: tuple[str, str, str]
+    """Task, split and partition."""
+
     path: Path
     content_sha256: str
     episodes: Sequence[Episode]
@@ -67,10 +69,16 @@ class Shard:
             names = [name for name in OBSERVATION_COLUMNS if name not in IMAGE_COLUMNS]
             columns = {name: file.column(name) for name in names}
             images = {name: PackedRows(file.column(name)) for name in IMAGE_COLUMNS}
-            task, sha256 = file.meta.task, file.content_sha256
+            origin = (file.meta.task, file.meta.split, file.meta.partition)
+            sha256 = file.content_sha256
             episodes, first_rows = file.episodes, file.first_rows
         _check_in_cube(path, columns["keyframe_in_base"][:, :3])
-        return cls(task, path, sha256, episodes, first_rows, columns, images)
+        return cls(origin, path, sha256, episodes, first_rows, columns, images)
+
+    @property
+    def task(self) -> str:
+        """Its task."""
+        return self.origin[0]
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -139,7 +147,7 @@ class KeyframeSet:
 
         Raises:
             UsageError: a file is missing (says how to make it), truncated, foreign, or of another
-                task than its name says.
+                task, split or partition than its place says.
         """
         missing = [task for task in tasks if not (folder / f"{task}.h5").is_file()]
         if missing:
@@ -148,10 +156,11 @@ class KeyframeSet:
             )
         shards = [Shard.load(folder / f"{task}.h5") for task in tasks]
         for task, shard in zip(tasks, shards, strict=True):
-            if shard.task != task:
+            place = (task, *folder.parts[-3:-1])
+            if shard.origin != place:
                 raise UsageError(
-                    f"{shard.path} holds keyframes of {shard.task}, not of {task}. Move it away. "
-                    + _gen_demos(folder, task)
+                    f"{shard.path} holds keyframes of {', '.join(shard.origin)}, not of "
+                    f"{', '.join(place)}. Move it away. " + _gen_demos(folder, task)
                 )
         return cls(shards)
 

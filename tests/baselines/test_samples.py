@@ -195,8 +195,17 @@ def test_a_missing_file_names_the_command_that_makes_it(tmp_path):
 def test_a_file_of_another_task_is_refused(tmp_path):
     path = synthetic.write_file(tmp_path, "pick_up_cup", demos=2)
     path.rename(path.with_name("pick_and_lift.h5"))
-    with pytest.raises(UsageError, match="keyframes of pick_up_cup, not of pick_and_lift"):
+    with pytest.raises(UsageError, match="keyframes of pick_up_cup, canon, train, not of pick_and"):
         KeyframeSet.load(path.parent, ["pick_and_lift"])
+
+
+def test_a_file_of_another_partition_is_refused(tmp_path):
+    path = synthetic.write_file(tmp_path, "pick_and_lift", demos=2)
+    held_out = tmp_path / "canon/val/keyframes"
+    held_out.mkdir(parents=True)
+    path.rename(held_out / path.name)
+    with pytest.raises(UsageError, match="canon, train, not of pick_and_lift, canon, val"):
+        KeyframeSet.load(held_out, ["pick_and_lift"])
 
 
 def test_a_draw_too_small_for_two_sizes_is_refused_instead_of_repeated_forever(keyframes):
