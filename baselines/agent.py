@@ -158,9 +158,7 @@ class AgentSpec:
             UsageError: no such preset or variant.
         """
         config = self.presets[find_name(preset, self.presets, f"preset of {self.name}")]
-        if variant is None:
-            return config
-        return self.variants[find_name(variant, self.variants, f"variant of {self.name}")](config)
+        return config if variant is None else self._change(variant)(config)
 
     def check_variant(self, variant: str | None, config: Any) -> None:
         """Refuse a config that is not what the variant's name says.
@@ -170,13 +168,15 @@ class AgentSpec:
         """
         if variant is None:
             return
-        change = self.variants[find_name(variant, self.variants, f"variant of {self.name}")]
-        given, meant = vars(config), vars(change(config))
+        given, meant = vars(config), vars(self._change(variant)(config))
         if wrong := [name for name in given if given[name] != meant[name]]:
             raise UsageError(
                 f"{self.name}:{variant} means {', '.join(f'{n} {meant[n]}' for n in wrong)}, not "
                 f"{', '.join(str(given[n]) for n in wrong)}. Take the agent without its variant."
             )
+
+    def _change(self, variant: str) -> Callable[[Any], Any]:
+        return self.variants[find_name(variant, self.variants, f"variant of {self.name}")]
 
 
 @cache

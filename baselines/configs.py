@@ -13,6 +13,9 @@ from sacil_tasks.errors import UsageError
 
 C = TypeVar("C")
 
+UNIONS = (typing.Union, types.UnionType)
+"""Origins of hints such as `int | None`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Range:
@@ -72,28 +75,21 @@ def check_numbers(config: Any) -> None:
 
 def _numbers(hint: Any, value: Any) -> Iterator[tuple[float, Range]]:
     """The numbers in a field's value, each with its range."""
-    if typing.get_origin(hint) is Annotated:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
         yield value, next(it for it in hint.__metadata__ if isinstance(it, Range))
-    elif isinstance(value, tuple):
-        kinds = [kind for kind in _tuple_kinds(hint) if kind is not ...]
-        for index, part in enumerate(value):
-            yield from _numbers(kinds[min(index, len(kinds) - 1)], part)
-    elif isinstance(value, bool):
-        return
-    elif isinstance(value, int | float):
-        inner = [kind for kind in typing.get_args(hint) if typing.get_origin(kind) is Annotated]
-        if inner:
-            yield from _numbers(inner[0], value)
-        else:
-            yield value, Range(1 if hint is int else 0)
+    elif origin in UNIONS:
+        yield from _numbers(next(it for it in arguments if _fits(it, value)), value)
+    elif origin is tuple:
+        for kind, part in zip(_kinds_of_parts(arguments, len(value)), value, strict=True):
+            yield from _numbers(kind, part)
+    elif hint in (int, float):
+        yield value, Range(1 if hint is int else 0)
 
 
-def _tuple_kinds(hint: Any) -> tuple[Any, ...]:
-    """Types of the parts of a tuple's hint, or of the tuple in a union."""
-    if typing.get_origin(hint) is tuple:
-        return typing.get_args(hint)
-    (found,) = (it for it in typing.get_args(hint) if typing.get_origin(it) is tuple)
-    return typing.get_args(found)
+def _kinds_of_parts(arguments: tuple[Any, ...], length: int) -> tuple[Any, ...]:
+    """Types of a tuple's parts, from the arguments of its hint; `length` is for open ones."""
+    return arguments[:1] * length if arguments[-1] is ... else arguments
 
 
 def restore(kind: type[C], values: Any, source: str, kinds: Mapping[str, type] | None = None) -> C:
@@ -133,12 +129,14 @@ def _fits(hint: Any, value: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return value in arguments
-    if origin in (typing.Union, types.UnionType):
+    if origin is Annotated:
+        return _fits(arguments[0], value)
+    if origin in UNIONS:
         return any(_fits(argument, value) for argument in arguments)
     if origin is tuple:
         if not isinstance(value, tuple):
             return False
-        kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        kinds = _kinds_of_parts(arguments, len(value))
         return len(kinds) == len(value) and all(map(_fits, kinds, value))
     if isinstance(value, bool):
         return hint in (bool, Any)
