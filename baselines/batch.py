@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn import functional
 
 Scene = TypeVar("Scene")
 """What the network's `Sight` makes of an observation: a dataclass of tensors."""
@@ -36,6 +37,10 @@ class Inputs(Generic[Scene]):
 
     text_mask: Bool[Tensor, "b t"]
     """True at real tokens; the last of them is the end-of-text token."""
+
+    def proprio_of(self, width: int) -> Float[Tensor, "b {width}"]:
+        """`proprio`, with zeros behind it for a network that reads more numbers."""
+        return functional.pad(self.proprio, (0, width - self.proprio.shape[1]))
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from baselines.optim import TensorTable
 from baselines.text import SentenceTable, TextSpec
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import atomic_path, content_hash, file_sha256, write_json
+from sacil_tasks.typed import parsed
 
 MODEL, CONFIG, TEXT = "model.safetensors", "config.json", "text.safetensors"
 PROVENANCE, STATE, METRICS = "provenance.json", "train_state.safetensors", "metrics.jsonl"
@@ -150,19 +151,38 @@ def fill(network: Network, weights: TensorTable, source: Path) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainState:
-    """Where a run stands: all tensors, and what was agreed when it began."""
+class Plan:
+    """What was agreed when a run began, and a resumed one must agree with."""
 
-    tensors: TensorTable
+    steps: int
+
+    request: Mapping[str, Any]
+    """What was asked for, apart from the budget."""
+
+    keyframes: Mapping[str, str]
+    """Task -> content hash of its keyframes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run has come."""
+
     step: int
-    plan: Mapping[str, Any]
     wall_s: float
     cpu_s: float
 
+
+@dataclass(frozen=True, kw_only=True)
+class TrainState:
+    """Where a run stands: all tensors, how far it has come, and what was agreed at its start."""
+
+    tensors: TensorTable
+    progress: Progress
+    plan: Plan
+
     def save(self, folder: Path) -> None:
         """Write `train_state.safetensors`."""
-        progress = {"step": self.step, "wall_s": self.wall_s, "cpu_s": self.cpu_s}
-        metadata = {"progress": json.dumps(progress), "plan": json.dumps(self.plan)}
+        metadata = {name: json.dumps(asdict(getattr(self, name))) for name in ("progress", "plan")}
         with atomic_path(folder / STATE) as draft:
             draft.write_bytes(save(self.tensors, metadata))
 
@@ -178,9 +198,10 @@ class TrainState:
             return None
         with _readable(path), safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-            progress, plan = json.loads(metadata["progress"]), json.loads(metadata["plan"])
+            progress = parsed(Progress, metadata["progress"])
+            plan = parsed(Plan, metadata["plan"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return cls(tensors=tensors, plan=plan, **progress)
+        return cls(tensors=tensors, progress=progress, plan=plan)
 
 
 def trained_samples(folder: Path) -> int:

@@ -3,13 +3,15 @@
 """
 
 import dataclasses
+import json
 import math
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 from sacil_tasks.errors import UsageError
+from sacil_tasks.typed import parsed
 
 C = TypeVar("C")
 
@@ -79,17 +81,16 @@ def _numbers(hint: Any, value: Any) -> Iterator[tuple[float, Range]]:
     if origin is Annotated:
         yield value, next(it for it in hint.__metadata__ if isinstance(it, Range))
     elif origin in UNIONS:
-        yield from _numbers(next(it for it in arguments if _fits(it, value)), value)
+        alike = [
+            it for it in arguments if (typing.get_origin(it) is tuple) == (type(value) is tuple)
+        ]
+        yield from _numbers(alike[0] if value is not None else None, value)
     elif origin is tuple:
-        for kind, part in zip(_kinds_of_parts(arguments, len(value)), value, strict=True):
+        kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        for kind, part in zip(kinds, value, strict=True):
             yield from _numbers(kind, part)
     elif hint in (int, float):
         yield value, Range(1 if hint is int else 0)
-
-
-def _kinds_of_parts(arguments: tuple[Any, ...], length: int) -> tuple[Any, ...]:
-    """Types of a tuple's parts, from the arguments of its hint; `length` is for open ones."""
-    return arguments[:1] * length if arguments[-1] is ... else arguments
 
 
 def restore(kind: type[C], values: Any, source: str, kinds: Mapping[str, type] | None = None) -> C:
@@ -118,28 +119,7 @@ def restore(kind: type[C], values: Any, source: str, kinds: Mapping[str, type] |
 def _restore_value(hint: Any, value: Any, source: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return restore(typing.cast(type, hint), value, source)
-    if isinstance(value, list):  # JSON has no tuples, configs no lists
-        value = tuple(value)
-    if not _fits(hint, value):
-        raise UsageError(f"{source} cannot be {value!r}.")
-    return value
-
-
-def _fits(hint: Any, value: Any) -> bool:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        return value in arguments
-    if origin is Annotated:
-        return _fits(arguments[0], value)
-    if origin in UNIONS:
-        return any(_fits(argument, value) for argument in arguments)
-    if origin is tuple:
-        if not isinstance(value, tuple):
-            return False
-        kinds = _kinds_of_parts(arguments, len(value))
-        return len(kinds) == len(value) and all(map(_fits, kinds, value))
-    if isinstance(value, bool):
-        return hint in (bool, Any)
-    if hint is float:
-        return isinstance(value, int | float)
-    return isinstance(value, hint) if isinstance(hint, type) else True
+    try:
+        return parsed(hint, json.dumps(value))
+    except ValueError as error:
+        raise UsageError(f"{source} cannot be {value!r}.") from error

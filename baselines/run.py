@@ -11,17 +11,18 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tqdm import tqdm
 
 from baselines.agent import Network, find_agent
-from baselines.checkpoint import METRICS, PROVENANCE, TrainState, save_weights
+from baselines.checkpoint import METRICS, PROVENANCE, Plan, Progress, TrainState, save_weights
 from baselines.distributed import anywhere, averaged, device_name, rank, ranks, wait_for_all
 from baselines.trainer import Trainer
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import atomic_path, code_version, content_hash, unwritable, write_json
+from sacil_tasks.typed import parsed
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,23 @@ SAVE_EVERY_S = 60.0
 
 Row: TypeAlias = dict[str, Any]
 Validator: TypeAlias = Callable[[Network], Row]
+
+
+@dataclass(frozen=True)
+class AnyRow:
+    """What every line of `metrics.jsonl` has."""
+
+    kind: Literal["train", "val"]
+    step: int
+
+
+@dataclass(frozen=True)
+class TrainRow(AnyRow):
+    """What lines about training have, among other means."""
+
+    loss: float
+    samples_per_s: float
+    cpu_s: float
 
 
 @dataclass
@@ -66,7 +84,7 @@ class Run:
     """
 
     def __init__(
-        self, trainer: Trainer, folder: Path, plan: Mapping[str, Any], *, validate: Validator | None
+        self, trainer: Trainer, folder: Path, plan: Plan, *, validate: Validator | None
     ) -> None:
         """`plan` is what a resumed run must agree with; `validate` gives a row of metrics."""
         self.listeners: list[Callable[[Row], None]] = []
@@ -86,14 +104,14 @@ class Run:
             UsageError: the state is one of another network.
         """
         try:
-            self.trainer.restore(state.tensors, state.step)
+            self.trainer.restore(state.tensors, state.progress.step)
         except (KeyError, RuntimeError) as error:
             raise UsageError(
                 f"{self.folder} holds the state of another network. Choose another --out."
             ) from error
-        self.wall_s, self.cpu_s = state.wall_s, state.cpu_s
+        self.wall_s, self.cpu_s = state.progress.wall_s, state.progress.cpu_s
         if rank() == 0:
-            trim_metrics(self.folder / METRICS, state.step)
+            trim_metrics(self.folder / METRICS, state.progress.step)
 
     def save(self) -> None:
         """Save the weights to evaluate and what is behind them, then the state.
@@ -109,13 +127,8 @@ class Run:
             return
         save_weights(self.folder, trainer.averaged)
         write_json(self.folder / PROVENANCE, self._provenance())
-        TrainState(
-            tensors=trainer.state(),
-            step=trainer.step,
-            plan=self.plan,
-            wall_s=self.wall_s,
-            cpu_s=self.cpu_s,
-        ).save(self.folder)
+        progress = Progress(step=trainer.step, wall_s=self.wall_s, cpu_s=self.cpu_s)
+        TrainState(tensors=trainer.state(), progress=progress, plan=self.plan).save(self.folder)
 
     def finish(self, *, validate_every: int) -> None:
         """Train to the last step.
@@ -160,7 +173,7 @@ class Run:
         self.wall_s += time.perf_counter() - wall
 
     def _provenance(self) -> Row:
-        trainer, request = self.trainer, self.plan["request"]
+        trainer, request = self.trainer, self.plan.request
         return {
             "agent": request["agent"],
             "preset": preset_name(request),
@@ -173,7 +186,7 @@ class Run:
             "core_minutes": round(self.cpu_s / 60, 2),
             "ranks": ranks(),
             "device": device_name(trainer.device),
-            "keyframes_sha256": self.plan["keyframes"],
+            "keyframes_sha256": self.plan.keyframes,
             "code_version": code_version(),
             "torch": torch.__version__,
         }
@@ -234,16 +247,27 @@ def append_row(path: Path, row: Row) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All whole lines of a metrics file; a line cut off by a kill is left out."""
+    """All whole lines of a metrics file; a line cut off by a kill is left out.
+
+    Raises:
+        UsageError: a line is not one of ours.
+    """
     if not path.is_file():
         return []
-    rows = []
-    for line in path.read_text().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
+    lines = path.read_text(errors="replace").split("\n")[:-1]
+    return [_row(path, number, line) for number, line in enumerate(lines, start=1)]
+
+
+def _row(path: Path, number: int, line: str) -> Row:
+    try:
+        if parsed(AnyRow, line, extra="ignore").kind == "train":
+            parsed(TrainRow, line, extra="ignore")
+    except ValueError as error:
+        raise UsageError(
+            f"{path} line {number} is not a line of training ({error}). The file is damaged or "
+            "foreign: move it away."
+        ) from error
+    return json.loads(line)
 
 
 def trim_metrics(path: Path, step: int) -> None:

@@ -20,7 +20,6 @@ from sacil_tasks.interface import MAX_KEYFRAMES, SCENE_BOUNDS, Observation
 from sacil_tasks.keyframes import (
     IMAGE_COLUMNS,
     NO_ROW,
-    OBSERVATION_COLUMNS,
     Episode,
     KeyframeFile,
 )
@@ -63,12 +62,16 @@ class Shard:
         """Read a whole keyframe file.
 
         Raises:
-            UsageError: missing, truncated or foreign file, or a keyframe outside the render cube.
+            UsageError: missing, truncated, foreign or changed file, or a keyframe outside the
+                render cube.
         """
+        columns, images = dict[str, np.ndarray](), dict[str, PackedRows]()
         with KeyframeFile.open(path) as file:
-            names = [name for name in OBSERVATION_COLUMNS if name not in IMAGE_COLUMNS]
-            columns = {name: file.column(name) for name in names}
-            images = {name: PackedRows(file.column(name)) for name in IMAGE_COLUMNS}
+            for name, rows in file.columns():
+                if name in IMAGE_COLUMNS:
+                    images[name] = PackedRows(rows)
+                else:
+                    columns[name] = rows
             origin = (file.meta.task, file.meta.split, file.meta.partition)
             sha256 = file.content_sha256
             episodes, first_rows = file.episodes, file.first_rows

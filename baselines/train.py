@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from baselines.checkpoint import METRICS, STATE, TEXT, TrainState, trained_samples
+from baselines.checkpoint import METRICS, STATE, TEXT, Plan, TrainState, trained_samples
 from baselines.distributed import of_first, process_group, rank, wait_for_all
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
@@ -88,59 +88,57 @@ def _earlier(job: Job) -> TrainState | None:
 
 
 def _is_complete(job: Job, state: TrainState | None) -> bool:
-    complete = state is not None and state.step == state.plan["steps"]
+    complete = state is not None and state.progress.step == state.plan.steps
     if complete and rank() == 0:
         print(f"nothing to do: {job.options.folder} is complete.")
     return complete
 
 
 def _begin(material: Material) -> Run:
-    """Fix the number of steps and write what does not change during the run."""
-    job, steps = material.job, _steps(material)
-    job = Job(job.options, with_samples(job.config, steps * job.config.recipe.batch))
-    material = replace(material, job=job, identity=replace(material.identity, config=job.config))
-    if rank() == 0:
-        _write_down(material)
+    """Fix the number of steps and begin, over whatever a run that never got this far has left."""
     data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
-    plan = {"steps": steps, "request": _request(job), "keyframes": data}
-    trainer = material.trainer(steps)
-    validate = material.validator(trainer.network.sight)
-    run = Run(trainer, job.options.folder, plan, validate=validate)
+    plan = Plan(steps=_steps(material), request=_request(material.job), keyframes=data)
+    if rank() == 0:
+        (material.job.options.folder / METRICS).unlink(missing_ok=True)
+    run = _run(material, plan)
     run.save()
     return run
 
 
-def _write_down(material: Material) -> None:
-    """Write what stays as it is, over whatever a run that never got this far has left."""
-    folder = material.job.options.folder
-    (folder / METRICS).unlink(missing_ok=True)
-    material.identity.save(folder)
-    sentences = set().union(*sentences_of(material.keyframes).values())
-    material.text.save(folder / TEXT, sentences)
+def _run(material: Material, plan: Plan) -> Run:
+    """The run at its first step; what does not change on its way is written down."""
+    options, config = material.job.options, material.job.config
+    config = with_samples(config, plan.steps * config.recipe.batch)
+    identity = replace(material.identity, config=config)
+    material = replace(material, job=Job(options, config), identity=identity)
+    if rank() == 0:
+        identity.save(options.folder)
+        sentences = set().union(*sentences_of(material.keyframes).values())
+        material.text.save(options.folder / TEXT, sentences)
+    trainer = material.trainer(plan.steps)
+    validate = material.validator(trainer.network.sight)
+    return Run(trainer, options.folder, plan, validate=validate)
 
 
 def _continue(material: Material, state: TrainState) -> Run:
     """Take up a run where it was saved."""
     found = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
-    for task, sha256 in state.plan["keyframes"].items():
-        if found[task] != sha256:
+    for task, sha256 in state.plan.keyframes.items():
+        if found.get(task) != sha256:
             raise UsageError(
                 f"the keyframes of {task} in {material.job.options.data} are not those the run "
                 "began with. Give their folder with --data, or choose another --out."
             )
-    trainer = material.trainer(state.plan["steps"])
-    folder = material.job.options.folder
-    validate = material.validator(trainer.network.sight)
-    run = Run(trainer, folder, state.plan, validate=validate)
+    run = _run(material, state.plan)
     run.resume(state)
     return run
 
 
 def _check_resumable(job: Job, state: TrainState) -> None:
-    options, steps = job.options, state.plan["steps"]
-    if not options.resume and state.step < steps:
+    options, step, steps = job.options, state.progress.step, state.plan.steps
+    if not options.resume and step < steps:
         raise UsageError(
-            f"{options.folder} holds a run that stopped at step {state.step} of {steps}. "
+            f"{options.folder} holds a run that stopped at step {step} of {steps}. "
             "Add --resume to complete it, or choose another --out."
         )
     asked = options.steps or (options.samples or 0) // job.config.recipe.batch or steps
@@ -149,7 +147,7 @@ def _check_resumable(job: Job, state: TrainState) -> None:
             f"{options.folder} holds a run of {steps} steps, but {asked} are asked for. "
             "Leave the budget out to complete it, or choose another --out."
         )
-    before, now = _flat(state.plan["request"]), _flat(_request(job))
+    before, now = _flat(state.plan.request), _flat(_request(job))
     for name in sorted(before.keys() | now.keys()):
         if before.get(name) != now.get(name):
             raise UsageError(

@@ -3,10 +3,9 @@
 Written before the first episode and kept true by every later command on the same folder.
 """
 
-import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +13,7 @@ from leaderboard.records import EPISODES_FILE
 from leaderboard.training import Training
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import package_version, write_json
+from sacil_tasks.typed import parsed
 
 KIND = "sacil-evaluation"
 SCHEMA_VERSION = 1
@@ -78,7 +78,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     try:
         return _parse(path)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError) as error:
         raise UsageError(
             f"{path} is not the manifest of an evaluation ({error}). "
             "Move the folder away, or choose another."
@@ -142,21 +142,19 @@ def installed_versions() -> dict[str, str]:
 
 
 def _parse(path: Path) -> Manifest:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    if (content["kind"], content["schema_version"]) != (KIND, SCHEMA_VERSION):
+    manifest = parsed(Manifest, path.read_text(encoding="utf-8"), extra="ignore")
+    if (manifest.kind, manifest.schema_version) != (KIND, SCHEMA_VERSION):
         raise ValueError(f"kind and schema_version are not {KIND} and {SCHEMA_VERSION}")
-    facts = content.pop("training", None)
-    content = {
-        field.name: content[field.name] for field in fields(Manifest) if field.name in content
-    }
-    return Manifest(**content, training=None if facts is None else Training.of(facts))
+    if nameless := [task for task, rules in manifest.protocols.items() if "hash" not in rules]:
+        raise ValueError(f"the protocol of {', '.join(nameless)} has no hash")
+    return manifest
 
 
 def _read_or_none(path: Path) -> Manifest | None:
     """A neighbour's manifest; a damaged one is the neighbour's business."""
     try:
         return _parse(path)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return None
 
 

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple, Self
 
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import unwritable, whole_lines
+from sacil_tasks.outcomes import OUTCOMES
+from sacil_tasks.typed import parsed
 
 SCHEMA_VERSION = 1
 EPISODES_FILE = "episodes.jsonl"
@@ -137,8 +139,24 @@ class EpisodeRecord:
         names = {field.name for field in fields(cls)}
         if wrong := (names ^ content.keys()) - (_LATER - content.keys()):
             raise ValueError(f"wrong or missing fields: {sorted(wrong)}")
-        lists = {name: tuple(content[name]) for name in ("sizes_m", "asked", "handled")}
-        return cls(**content | lists | {"seconds": Seconds(**content["seconds"])})
+        record = parsed(cls, line)
+        if not record.consistent:
+            raise ValueError(
+                f"outcome {record.outcome}, end {record.end}, success {record.success} (lenient "
+                f"{record.success_lenient}) contradict each other"
+            )
+        return record
+
+    @property
+    def consistent(self) -> bool:
+        """Whether verdict, outcome code and end can stand beside each other."""
+        return (
+            self.outcome in (*OUTCOMES, ERROR)
+            and self.success == (self.outcome == OUTCOMES[0])
+            and self.success_lenient == (self.end == SUCCEEDED)
+            and self.errored == (self.outcome == ERROR)
+            and self.success_lenient >= self.success
+        )
 
 
 class EpisodeLog:
@@ -226,7 +244,7 @@ def read_records(path: Path) -> list[EpisodeRecord]:
 def _parse(path: Path, number: int, line: str) -> EpisodeRecord:
     try:
         return EpisodeRecord.from_json(line)
-    except (ValueError, TypeError, KeyError) as error:
+    except ValueError as error:
         raise UsageError(
             f"{path} line {number} is not an episode record of schema {SCHEMA_VERSION} ({error}). "
             "The file is damaged or foreign: move it away, or choose another folder."

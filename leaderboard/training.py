@@ -5,15 +5,15 @@ leave such a file beside its weights; without one its budget is unknown.
 """
 
 import importlib.util
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from leaderboard.agents import AGENT_PACKAGES
 from sacil_tasks.files import content_hash, file_sha256
+from sacil_tasks.typed import parsed
 
 PROVENANCE_FILE = "provenance.json"
 HASHED_FILES = ("model.safetensors", "config.json")
@@ -76,20 +76,6 @@ class Training:
     keyframes_sha256: Mapping[str, str]
     """Task -> hash of the keyframes it was trained on."""
 
-    @classmethod
-    def of(cls, content: Any) -> Self:
-        """From parsed JSON; what else is there is ignored.
-
-        Raises:
-            ValueError: it does not say what it should.
-        """
-        if not isinstance(content, dict):
-            raise ValueError("training facts are not an object")
-        found: dict[str, Any] = {field.name: content.get(field.name) for field in fields(cls)}
-        if not all(isinstance(found[name], kind) for name, kind in _KINDS.items()):
-            raise ValueError(f"training facts are not {', '.join(_KINDS)}")
-        return cls(**found)
-
     @property
     def terms(self) -> Terms:
         """What other rows must agree with."""
@@ -97,21 +83,11 @@ class Training:
         return Terms(self.samples, self.preset, self.text, keyframes)
 
 
-_KINDS = {
-    "agent": str,
-    "preset": str,
-    "text": str,
-    "seed": int,
-    "samples": int,
-    "core_minutes": int | float,
-    "keyframes_sha256": dict,
-}
-
-
 def read_training(checkpoint: Path) -> Training | None:
     """The training facts in a checkpoint folder, or None if it has none that we can read."""
     try:
-        return Training.of(json.loads((checkpoint / PROVENANCE_FILE).read_text(encoding="utf-8")))
+        facts = (checkpoint / PROVENANCE_FILE).read_text(encoding="utf-8")
+        return parsed(Training, facts, extra="ignore")
     except (OSError, ValueError):
         return None
 

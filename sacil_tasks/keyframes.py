@@ -61,6 +61,9 @@ EPISODE_COLUMNS: Mapping[str, tuple[Any, tuple[int, ...]]] = {
 }
 """Type and shape of one row of each dataset in `episodes/`."""
 
+TABLES = ("observations", "episodes")
+"""Groups of a file, and what its content hash is taken of."""
+
 IMAGE_COLUMNS = ("rgb", "depth_mm")
 """Columns stored in compressed chunks of one demo, so that files are merged without unpacking."""
 
@@ -196,20 +199,27 @@ def seal(file: h5py.File, meta: KeyframeMeta) -> None:
     file.attrs["max_steps"] = MAX_KEYFRAMES
     file.attrs["kind"] = KIND
     file.attrs["schema_version"] = SCHEMA_VERSION
-    file.attrs["content_sha256"] = arrays_sha256(file, ("observations", "episodes"))
+    file.attrs["content_sha256"] = arrays_sha256(file, TABLES)
 
 
 def arrays_sha256(file: h5py.Group, groups: Sequence[str]) -> str:
     """SHA-256 over names, types, shapes and values of all datasets below `groups`, in hex."""
     digest = hashlib.sha256()
-    for name, dataset in sorted((n, d) for g in groups for n, d in _datasets(file[g])):
-        digest.update(f"{name} {dataset.dtype.kind} {dataset.shape}".encode())
-        values = dataset[()]
-        if dataset.dtype.kind == "O":
-            digest.update(json.dumps([text.decode() for text in values]).encode())
-        else:
-            digest.update(np.ascontiguousarray(values).data)
+    for name, dataset in _sorted_datasets(file, groups):
+        _absorb(digest, name, dataset, dataset[()])
     return digest.hexdigest()
+
+
+def _absorb(digest: "hashlib._Hash", name: str, dataset: h5py.Dataset, values: np.ndarray) -> None:
+    digest.update(f"{name} {dataset.dtype.kind} {dataset.shape}".encode())
+    if dataset.dtype.kind == "O":
+        digest.update(json.dumps([text.decode() for text in values]).encode())
+    else:
+        digest.update(np.ascontiguousarray(values).data)
+
+
+def _sorted_datasets(file: h5py.Group, groups: Sequence[str]) -> list[tuple[str, h5py.Dataset]]:
+    return sorted((name, dataset) for group in groups for name, dataset in _datasets(file[group]))
 
 
 def _datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
@@ -271,7 +281,7 @@ class KeyframeFile:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open and check the layout (not the pixels: damaged ones fail when they are read).
+        """Open and check the layout; `columns` checks the content.
 
         Raises:
             UsageError: missing, truncated, foreign, or of another schema version.
@@ -293,16 +303,25 @@ class KeyframeFile:
         file.close()
         raise _unusable(path, fault)
 
-    def column(self, name: str) -> np.ndarray:
-        """All rows of the dataset `observations/<name>`.
+    def columns(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Names and all rows of the datasets in `observations/`, one after another.
 
         Raises:
-            UsageError: the stored chunks are damaged.
+            UsageError: stored chunks are damaged, or, after the last column, the file does not
+                hold what its content hash says: somebody has changed it.
         """
-        try:
-            return self._file[f"observations/{name}"][:]
-        except OSError as error:
-            raise _unusable(self.path, f"damaged in '{name}'") from error
+        digest = hashlib.sha256()
+        for place, dataset in _sorted_datasets(self._file, TABLES):
+            _, table, name = place.split("/")
+            try:
+                rows = dataset[()]
+            except OSError as error:
+                raise _unusable(self.path, f"damaged in '{name}'") from error
+            _absorb(digest, place, dataset, rows)
+            if table == "observations":
+                yield name, rows
+        if digest.hexdigest() != self.content_sha256:
+            raise _unusable(self.path, "not what its content hash says: it was changed afterwards")
 
     def observation(self, row: int) -> Observation:
         """The observation of one row, as a policy would have seen it."""

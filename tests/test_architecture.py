@@ -20,7 +20,7 @@ ALLOWED = {
 MODULES = sorted(path for package in ALLOWED for path in (ROOT / package).rglob("*.py"))
 CONTRACT = (
     *("aim", "catalog", "contents", "errors", "files", "instructions", "interface", "keyframes"),
-    *("outcomes", "scenes", "sizes", "spec", "splits", "vulkan", "wording", "workers"),
+    *("outcomes", "scenes", "sizes", "spec", "splits", "typed", "vulkan", "wording", "workers"),
 )
 """What baselines may know of the benchmark; none of it starts torch or the simulator."""
 INSIDE_THE_WORKER = {"film", "probes", "rollout", "worker"}

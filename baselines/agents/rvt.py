@@ -10,6 +10,7 @@ The preset `paper` is the published network (section 3 of that paper; 36,348,093
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from baselines.agent import AgentSpec, Network, Recipe
 from baselines.batch import Batch, Inputs, Prediction
+from baselines.configs import Range
 from baselines.layers.attention import NormedLinear, linear, padding_bias
 from baselines.layers.heads import ActionLogits, action_loss, choose
 from baselines.layers.multiview import (
@@ -40,9 +42,9 @@ from baselines.text import TextSpec
 class RvtConfig(MultiViewConfig):
     """Sizes of RVT; the defaults are the `cpu` preset."""
 
-    proprio_width: int = 2
+    proprio_width: Annotated[int, Range(2)] = 2
     """Proprioceptive numbers: gripper open and time. RVT has two more, the finger joints, which
-    would tell the size of what is held (D-proprio)."""
+    would tell the size of what is held (D-proprio); any more are zeros here."""
 
     proprio_channels: int = 64
     """Channels of proprioception beside those of every image token."""
@@ -112,6 +114,7 @@ class Transformer(nn.Module):
         self.views = len(config.views)
         joined = config.stem_channels + config.proprio_channels
         self.encoder = ViewEncoder(config)
+        self.proprio_width = config.proprio_width
         self.proprio = NormedLinear(config.proprio_width, config.proprio_channels)
         self.position = positions(config, joined)
         self.text = NormedLinear(text.dim, joined)
@@ -122,7 +125,8 @@ class Transformer(nn.Module):
     def read(self, views: Float[Tensor, "b v 7 h w"], inputs: Inputs) -> Read:
         """Look at the views with the words and the proprioception of `inputs`."""
         tokens, skips = self.encoder(views)
-        proprio = self.proprio(inputs.proprio)[:, None].expand(-1, tokens.shape[1], -1)
+        state = self.proprio(inputs.proprio_of(self.proprio_width))
+        proprio = state[:, None].expand(-1, tokens.shape[1], -1)
         tokens = self.lift(torch.cat([tokens, proprio], dim=-1) + self.position)
         alone = within_views(self.view_blocks, tokens, self.views)
         return Read(alone=alone, joined=self._with_words(alone, inputs), skips=skips)

@@ -13,7 +13,7 @@ Stem, decoder, head and recipe are those of `rvt`, so the difference between the
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from einops import reduce
@@ -24,7 +24,7 @@ from torch.nn import functional
 from baselines.agent import AgentSpec, Network
 from baselines.agents.rvt import PAPER_RECIPE
 from baselines.batch import Batch, Inputs, Prediction
-from baselines.configs import Natural
+from baselines.configs import Natural, Range
 from baselines.layers.attention import NormedLinear, linear, mlp, padding_bias
 from baselines.layers.heads import ActionLogits, action_loss, choose
 from baselines.layers.multiview import (
@@ -64,8 +64,8 @@ class SacilConfig(MultiViewConfig):
     current_goal_weight: float = 1.0
     """Weight of Current-Goal Contrast (Eq. 4); 0 leaves it and the goal views out."""
 
-    proprio_width: int = 2
-    """Proprioceptive numbers: gripper open and time (D-proprio)."""
+    proprio_width: Annotated[int, Range(2)] = 2
+    """Proprioceptive numbers: gripper open and time (D-proprio); any more are zeros."""
 
     view_layers: int = 2
     """Self-attention layers within each view (section 3.3)."""
@@ -150,7 +150,7 @@ class Sacil(Network):
         read = self._read(tokens, sentence)
         # Proprioception enters here and not before (D-proprio-late): the time step alone would
         # tell Image-Text Contrast which samples are first keyframes.
-        tokens = tokens + self.proprio(inputs.proprio)[:, None]
+        tokens = tokens + self.proprio(inputs.proprio_of(self.config.proprio_width))[:, None]
         tokens, queries = self._join(tokens, read.queries, inputs)
         situation = tokens if self.queries is None else queries
         return Seen(

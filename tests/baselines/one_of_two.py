@@ -106,7 +106,7 @@ def everything(data: Path, out: Path) -> None:
     at_step(5, 1, lambda: signal.raise_signal(signal.SIGINT))
     with suppress(KeyboardInterrupt):
         train(data, out / "stopped")
-    stopped_at = run.TrainState.load(out / "stopped").step
+    stopped_at = run.TrainState.load(out / "stopped").progress.step
     train(data, out / "stopped", "--resume")
     at_step(3, 1, diverge)
     try:

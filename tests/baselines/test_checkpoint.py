@@ -10,7 +10,17 @@ from safetensors.torch import load_file, save
 from baselines import agent, checkpoint, release
 from baselines.agent import Recipe, find_agent
 from baselines.batch import Inputs
-from baselines.checkpoint import CONFIG, MODEL, PROVENANCE, STATE, TEXT, Identity, TrainState
+from baselines.checkpoint import (
+    CONFIG,
+    MODEL,
+    PROVENANCE,
+    STATE,
+    TEXT,
+    Identity,
+    Plan,
+    Progress,
+    TrainState,
+)
 from baselines.configs import restore
 from baselines.release import ReleaseConfig
 from baselines.scene.augment import AugmentConfig
@@ -42,7 +52,8 @@ def folder(tmp_path, identity):
     known = {"lift it": np.ones((3, 8), np.float16)}
     SentenceTable(TEXT_SPEC, known).save(path / TEXT, known)
     (path / PROVENANCE).write_text('{"complete": true}')
-    TrainState(tensors={}, step=5, plan={}, wall_s=0, cpu_s=0).save(path)
+    plan = Plan(steps=5, request={}, keyframes={})
+    TrainState(tensors={}, progress=Progress(step=5, wall_s=0, cpu_s=0), plan=plan).save(path)
     return path
 
 
@@ -139,10 +150,11 @@ def test_a_config_of_other_sizes_does_not_fit_the_weights(folder, identity):
 
 def test_a_state_comes_back_bit_for_bit(tmp_path):
     tensors = {"weights/a": torch.randn(3), "average/n": torch.tensor(7)}
-    state = TrainState(tensors=tensors, step=9, plan={"steps": 10}, wall_s=1.5, cpu_s=1.0)
-    state.save(tmp_path)
+    progress = Progress(step=9, wall_s=1.5, cpu_s=1.0)
+    plan = Plan(steps=10, request={"seed": 0}, keyframes={"pick_and_lift": "a1"})
+    TrainState(tensors=tensors, progress=progress, plan=plan).save(tmp_path)
     loaded = TrainState.load(tmp_path)
-    assert (loaded.step, loaded.plan, loaded.wall_s) == (9, {"steps": 10}, 1.5)
+    assert (loaded.progress, loaded.plan) == (progress, plan)
     assert all(torch.equal(loaded.tensors[name], tensors[name]) for name in tensors)
 
 
@@ -151,9 +163,14 @@ def test_no_state_is_none_and_a_damaged_one_is_named(tmp_path):
     (tmp_path / STATE).write_bytes(b"1234")
     with pytest.raises(UsageError, match=r"train_state\.safetensors is truncated"):
         TrainState.load(tmp_path)
-    (tmp_path / STATE).write_bytes(save({"a": torch.ones(1)}))
-    with pytest.raises(UsageError, match="truncated or foreign"):
-        TrainState.load(tmp_path)
+    for metadata in (
+        None,
+        {"progress": "5", "plan": "{}"},
+        {"progress": '{"step": "5", "wall_s": 1, "cpu_s": 1}', "plan": "{}"},
+    ):
+        (tmp_path / STATE).write_bytes(save({"a": torch.ones(1)}, metadata))
+        with pytest.raises(UsageError, match="truncated or foreign"):
+            TrainState.load(tmp_path)
 
 
 def test_a_release_is_half_as_large_and_loads_alone(folder, tmp_path):

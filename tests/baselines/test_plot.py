@@ -9,6 +9,7 @@ from sacil_tasks.errors import UsageError
 def write_run(folder, name, *, contrast):
     rows = [
         {"kind": "train", "step": step, "cpu_s": 60.0 * step, "bc/position": 9 - step}
+        | {"loss": 1.0, "samples_per_s": 9.0}
         | ({"itc/loss": 2.0} if contrast else {})
         for step in (1, 2)
     ]
@@ -51,7 +52,7 @@ def test_the_picture_is_written(tmp_path):
     assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("content", [None, "", "not json\n"])
+@pytest.mark.parametrize("content", [None, "", "not json"])
 def test_a_folder_without_a_run_is_named(tmp_path, content):
     if content is not None:
         (tmp_path / "metrics.jsonl").write_text(content)

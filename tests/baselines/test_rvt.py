@@ -54,6 +54,15 @@ def test_every_view_hears_of_a_change_in(network: Rvt, field: str) -> None:
     assert ((before - after).abs().amax(dim=(-1, -2)) > 0).all()
 
 
+def test_more_proprioceptive_numbers_than_given_are_zeros(network: Rvt) -> None:
+    inputs = make_inputs(SIGHT)
+    narrow, wide = network.eval(), Rvt(replace(CONFIG, proprio_width=4), TEXT).eval()
+    weights, first = wide.state_dict(), "proprio.linear.weight"
+    narrow.load_state_dict(weights | {first: weights[first][:, :2]})
+    with torch.no_grad():
+        assert torch.equal(wide(inputs).heatmaps, narrow(inputs).heatmaps)
+
+
 def test_image_noise_is_bounded_and_spares_the_original() -> None:
     scene = make_inputs(SIGHT).scene
     assert roughened(scene, 0.0) is scene

@@ -17,7 +17,7 @@ from baselines.scene.sight import Moment, ViewSight
 from baselines.scene.views import base_from_cube
 from baselines.text import SentenceTable, TextSpec, tidy
 from sacil_tasks.errors import UsageError
-from sacil_tasks.keyframes import IMAGE_COLUMNS
+from sacil_tasks.keyframes import IMAGE_COLUMNS, TABLES, arrays_sha256
 
 TASKS = ("pick_and_lift", "pick_up_cup")
 STILL = AugmentConfig(yaw_rad=0.0, translation_m=0.0)
@@ -239,5 +239,6 @@ def test_a_keyframe_outside_the_render_cube_is_refused(tmp_path):
     path = synthetic.write_file(tmp_path, "pick_and_lift", demos=2)
     with h5py.File(path, "r+") as file:
         file["observations/keyframe_in_base"][1, 1] = 0.5
+        file.attrs["content_sha256"] = arrays_sha256(file, TABLES)
     with pytest.raises(UsageError, match="1 keyframes lie outside the cube"):
         Shard.load(path)

@@ -15,7 +15,16 @@ import torch
 from tensorboardX.proto import event_pb2
 
 from baselines import agent, material, run, trainer
-from baselines.checkpoint import CONFIG, METRICS, MODEL, PROVENANCE, STATE, TrainState, load
+from baselines.checkpoint import (
+    CONFIG,
+    METRICS,
+    MODEL,
+    PROVENANCE,
+    STATE,
+    TEXT,
+    TrainState,
+    load,
+)
 from baselines.options import parse
 from baselines.run import Means, read_rows
 from baselines.tensorboard import EVENTS
@@ -152,6 +161,30 @@ def test_a_run_that_died_ends_in_the_same_bits_and_lines(data, tmp_path, unbroke
     assert rows_without_timing(tmp_path / "run") == rows_without_timing(unbroken)
 
 
+@pytest.mark.parametrize("name", [CONFIG, TEXT])
+def test_what_does_not_change_is_there_again_after_a_resumption(
+    data, tmp_path, unbroken, monkeypatch, name
+):
+    flags = (data, tmp_path / "run", "--steps", "12", "--validate-every", "4")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(*flags)
+    (tmp_path / "run" / name).unlink()
+    train(*flags, "--resume")
+    assert (tmp_path / "run" / name).read_bytes() == (unbroken / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "line", ["[]", "{}", '{"kind": "nap", "step": 1}', '{"kind": "train", "step": 1, "loss": "?"}']
+)
+def test_a_foreign_metrics_file_is_named(tmp_path, line):
+    good = '{"kind": "val", "step": 1}'
+    (tmp_path / METRICS).write_text(f"{good}\n{line}\n{line[:2]}")
+    with pytest.raises(UsageError, match=r"metrics\.jsonl line 2 is not a line of training"):
+        read_rows(tmp_path / METRICS)
+
+
 @pytest.mark.slow
 def test_kill_9_in_a_real_process_loses_nothing(data, tmp_path, unbroken):
     here = Path(__file__).parent
@@ -273,7 +306,7 @@ def test_weights_that_a_step_has_spoilt_are_not_saved(data, tmp_path, monkeypatc
     monkeypatch.setattr(trainer.Lamb, "step", spoil)
     with pytest.raises(UsageError, match="a weight is no longer finite at step 4"):
         train(data, tmp_path / "run", "--steps", "12")
-    assert TrainState.load(tmp_path / "run").step == 2
+    assert TrainState.load(tmp_path / "run").progress.step == 2
 
 
 def test_minutes_become_steps_that_are_kept(data, tmp_path, capsys):

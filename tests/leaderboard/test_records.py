@@ -47,6 +47,53 @@ def test_a_foreign_line_is_refused_and_left_alone(run_folder, junk):
     assert log.read_text() == content
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scene": "3"},
+        {"success": 1},
+        {"handled": "small"},
+        {"asked": [1]},
+        {"seconds": {"total": "long"}},
+        {"seconds": {"napping": 1.0}},
+        {"sizes_m": None},
+    ],
+    ids=str,
+)
+def test_a_value_of_another_type_is_refused(run_folder, changes):
+    log = run_folder / EPISODES_FILE
+    first, *rest = log.read_text().splitlines()
+    log.write_text("\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n")
+    with pytest.raises(
+        UsageError, match=rf"line 1 is not an episode record.*{next(iter(changes))}"
+    ):
+        read_records(log)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"outcome": "SUCCESS", "success": False},
+        {"outcome": "MOTOR_FAIL", "success": True},
+        {"success": True, "success_lenient": False},
+        {"success_lenient": True, "end": "limit"},
+        {"outcome": "ERROR", "end": "limit"},
+        {"outcome": "TRIUMPH"},
+    ],
+    ids=str,
+)
+def test_a_verdict_that_contradicts_itself_does_not_count(run_folder, changes):
+    log = run_folder / EPISODES_FILE
+    failed = {"success": False, "success_lenient": False, "outcome": "MOTOR_FAIL", "end": "limit"}
+    first, *rest = log.read_text().splitlines()
+    fine = json.loads(first) | failed
+    log.write_text("\n".join([json.dumps(fine), *rest]) + "\n")
+    assert not read_records(log)[0].success
+    log.write_text("\n".join([json.dumps(fine | changes), *rest]) + "\n")
+    with pytest.raises(UsageError, match="contradict each other"):
+        read_records(log)
+
+
 def test_a_foreign_file_without_a_whole_line_is_refused_and_left_alone(tmp_path):
     (tmp_path / EPISODES_FILE).write_text("no end of line")
     with pytest.raises(UsageError, match="no episode log"):

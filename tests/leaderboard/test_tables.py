@@ -2,6 +2,7 @@
 
 import json
 from collections import defaultdict
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -240,7 +241,7 @@ def test_released_weights_are_found_by_their_hash():
         assert trainings.checkpoint_sha256(folder) == sha256
         found = trainings.training_behind(None, sha256)
         provenance = json.loads((folder / checkpoints.PROVENANCE).read_text())
-        assert found == trainings.Training.of(provenance)
+        assert asdict(found).items() <= provenance.items()
         assert set(found.terms.tasks) == set(suite_tasks("slice"))
         assert found == trainings.training_behind(folder, sha256)
     assert trainings.training_behind(None, "0" * 64) is None

@@ -99,14 +99,15 @@ def test_observations_and_episodes_survive_a_round_trip(path, demos):
 
 def test_labels_stand_beside_the_observation_they_follow(path, demos):
     with KeyframeFile.open(path) as file:
-        poses = file.column("keyframe_in_base")
-        assert file.column("next_index").tolist() == [1, 2, 3, -1, 5, 6, 7, -1]
-        assert file.column("episode_id").tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+        columns = dict(file.columns())
+        poses = columns["keyframe_in_base"]
+        assert columns["next_index"].tolist() == [1, 2, 3, -1, 5, 6, 7, -1]
+        assert columns["episode_id"].tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
         assert np.isnan(poses[[3, 7]]).all()
         second = demos[1].keyframes[1]
         np.testing.assert_allclose(poses[5], [*second.position_m, *second.quaternion_wxyz], 1e-6)
-        assert file.column("keyframe_open")[5] == second.gripper_open
-        assert file.column("target_index").tolist() == [
+        assert columns["keyframe_open"][5] == second.gripper_open
+        assert columns["target_index"].tolist() == [
             *demos[0].targets,
             -1,
             *demos[1].targets,
@@ -204,7 +205,15 @@ def test_flipped_bits_are_noticed_when_the_pixels_are_read(path):
     content[offset + 1000] ^= 1
     path.write_bytes(bytes(content))
     with KeyframeFile.open(path) as file, pytest.raises(UsageError, match="damaged in 'depth_mm'"):
-        file.column("depth_mm")
+        dict(file.columns())
+
+
+@pytest.mark.parametrize("place", ["observations/tcp_in_base", "episodes/scene_index"])
+def test_a_value_that_was_changed_afterwards_is_noticed(path, place):
+    with h5py.File(path, "r+") as file:
+        file[place][0] += 1
+    with KeyframeFile.open(path) as file, pytest.raises(UsageError, match="content hash"):
+        dict(file.columns())
 
 
 def test_a_place_that_cannot_be_written_is_a_usage_error(tmp_path, demos):
