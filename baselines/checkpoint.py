@@ -200,15 +200,26 @@ class TrainState:
             metadata = file.metadata() or {}
             progress = parsed(Progress, metadata["progress"])
             plan = parsed(Plan, metadata["plan"])
+            if not 0 <= progress.step <= plan.steps:
+                raise ValueError(f"step {progress.step} of {plan.steps}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return cls(tensors=tensors, progress=progress, plan=plan)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What `provenance.json` says of the samples behind weights."""
+
+    samples: int | None = None
 
 
 def trained_samples(folder: Path) -> int:
     """Samples that the weights in `folder` have seen; 0 where there are none, or untrained ones."""
     if not (folder / MODEL).is_file() or not (folder / PROVENANCE).is_file():
         return 0
-    return int(_read_json(folder / PROVENANCE).get("samples") or 0)
+    with _readable(folder / PROVENANCE):
+        seen = parsed(_Seen, (folder / PROVENANCE).read_text(), extra="ignore")
+    return seen.samples or 0
 
 
 def export_release(run: Path, target: Path) -> None:
@@ -287,7 +298,7 @@ def _readable(path: Path) -> Iterator[None]:
     """Turn what goes wrong while reading `path` into one sentence."""
     try:
         yield
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, ValueError, RecursionError) as error:
         reason = "missing" if not path.is_file() else f"truncated or foreign ({error})"
         raise UsageError(
             f"{path} is {reason}. Copy the checkpoint again, or train again."

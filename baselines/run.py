@@ -55,6 +55,24 @@ class TrainRow(AnyRow):
     cpu_s: float
 
 
+@dataclass(frozen=True)
+class Scores:
+    """What a validation says of all keyframes, among other scores."""
+
+    position_mm: float
+    selected_by_words: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ValRow(AnyRow):
+    """What lines about validation have, among scores of tasks."""
+
+    all: Scores
+
+
+ROWS: Mapping[str, type[AnyRow]] = {"train": TrainRow, "val": ValRow}
+
+
 @dataclass
 class Means:
     """Averages of named scalars, each over the steps on which it existed (was not NaN)."""
@@ -260,8 +278,7 @@ def read_rows(path: Path) -> list[Row]:
 
 def _row(path: Path, number: int, line: str) -> Row:
     try:
-        if parsed(AnyRow, line, extra="ignore").kind == "train":
-            parsed(TrainRow, line, extra="ignore")
+        parsed(ROWS[parsed(AnyRow, line, extra="ignore").kind], line, extra="ignore")
     except ValueError as error:
         raise UsageError(
             f"{path} line {number} is not a line of training ({error}). The file is damaged or "

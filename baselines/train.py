@@ -17,7 +17,16 @@ from typing import Any
 
 import torch
 
-from baselines.checkpoint import METRICS, STATE, TEXT, Plan, TrainState, trained_samples
+from baselines.checkpoint import (
+    CONFIG,
+    METRICS,
+    STATE,
+    TEXT,
+    Identity,
+    Plan,
+    TrainState,
+    trained_samples,
+)
 from baselines.distributed import of_first, process_group, rank, wait_for_all
 from baselines.material import Material, sentences_of
 from baselines.options import Job, parse, with_samples
@@ -100,28 +109,46 @@ def _begin(material: Material) -> Run:
     plan = Plan(steps=_steps(material), request=_request(material.job), keyframes=data)
     if rank() == 0:
         (material.job.options.folder / METRICS).unlink(missing_ok=True)
+    material = _planned(material, plan)
     run = _run(material, plan)
+    _write_down(material)
     run.save()
     return run
 
 
-def _run(material: Material, plan: Plan) -> Run:
-    """The run at its first step; what does not change on its way is written down."""
-    options, config = material.job.options, material.job.config
-    config = with_samples(config, plan.steps * config.recipe.batch)
+def _planned(material: Material, plan: Plan) -> Material:
+    """The same material for a run of so many steps."""
+    config = with_samples(material.job.config, plan.steps * material.job.config.recipe.batch)
     identity = replace(material.identity, config=config)
-    material = replace(material, job=Job(options, config), identity=identity)
-    if rank() == 0:
-        identity.save(options.folder)
-        sentences = set().union(*sentences_of(material.keyframes).values())
-        material.text.save(options.folder / TEXT, sentences)
+    return replace(material, job=Job(material.job.options, config), identity=identity)
+
+
+def _run(material: Material, plan: Plan) -> Run:
+    """The run at its first step."""
     trainer = material.trainer(plan.steps)
     validate = material.validator(trainer.network.sight)
-    return Run(trainer, options.folder, plan, validate=validate)
+    return Run(trainer, material.job.options.folder, plan, validate=validate)
+
+
+def _write_down(material: Material) -> None:
+    """Write what does not change during a run."""
+    if rank() > 0:
+        return
+    folder = material.job.options.folder
+    material.identity.save(folder)
+    sentences = set().union(*sentences_of(material.keyframes).values())
+    material.text.save(folder / TEXT, sentences)
 
 
 def _continue(material: Material, state: TrainState) -> Run:
-    """Take up a run where it was saved."""
+    """Take up a run where it was saved; files that were lost meanwhile are written again."""
+    material = _planned(material, state.plan)
+    folder, encoder = material.job.options.folder, material.text.spec
+    if (folder / CONFIG).is_file() and (before := Identity.load(folder).text) != encoder:
+        raise UsageError(
+            f"{folder} holds a run that reads words by {before.short}, but what this machine has "
+            f"under that name is {encoder.short}. Bring back its files, or choose another --out."
+        )
     found = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
     for task, sha256 in state.plan.keyframes.items():
         if found.get(task) != sha256:
@@ -131,6 +158,7 @@ def _continue(material: Material, state: TrainState) -> Run:
             )
     run = _run(material, state.plan)
     run.resume(state)
+    _write_down(material)
     return run
 
 

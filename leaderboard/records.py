@@ -26,6 +26,7 @@ ERROR = "ERROR"
 
 SUCCEEDED, LIMIT, INVALID_ACTION, BROKE_OFF = "success", "limit", "invalid_action", "error"
 """Why an episode ended: first lenient success, keyframes spent, action refused, exception."""
+ENDS = (SUCCEEDED, LIMIT, INVALID_ACTION, BROKE_OFF)
 
 
 _LATER = {"aimed"}
@@ -156,6 +157,7 @@ class EpisodeRecord:
             and self.success_lenient == (self.end == SUCCEEDED)
             and self.errored == (self.outcome == ERROR)
             and self.success_lenient >= self.success
+            and self.end in ENDS
         )
 
 
@@ -244,7 +246,7 @@ def read_records(path: Path) -> list[EpisodeRecord]:
 def _parse(path: Path, number: int, line: str) -> EpisodeRecord:
     try:
         return EpisodeRecord.from_json(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(
             f"{path} line {number} is not an episode record of schema {SCHEMA_VERSION} ({error}). "
             "The file is damaged or foreign: move it away, or choose another folder."

@@ -132,7 +132,8 @@ def describe(error: Exception) -> str:
     """One line: what was raised and where."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}{place}"
+    words = f"{type(error).__name__}: {' '.join(str(error).split())}{place}"
+    return words.encode(errors="backslashreplace").decode()  # file names may hold any bytes
 
 
 @cache

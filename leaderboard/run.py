@@ -140,7 +140,7 @@ def command_line(config: RunConfig) -> str:
         if value != field.default:
             values = value if isinstance(value, tuple) else () if value is True else (value,)
             words += [f"--{field.name}", *map(str, values)]
-    return shlex.join(words)
+    return shlex.join(words).encode(errors="backslashreplace").decode()  # paths hold any bytes
 
 
 def main(config: RunConfig) -> None:

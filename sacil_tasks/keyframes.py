@@ -21,6 +21,7 @@ from jaxtyping import Float32
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import atomic_hdf5
 from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, Keyframe, Observation
+from sacil_tasks.typed import parsed
 
 KIND = "sacil-keyframes"
 SCHEMA_VERSION = 2
@@ -298,7 +299,7 @@ class KeyframeFile:
             fault = _layout_fault(file)
             if fault is None:
                 return cls(path, file)
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError, TypeError) as error:
             fault = f"damaged ({error})"
         file.close()
         raise _unusable(path, fault)
@@ -357,9 +358,8 @@ def _meta(file: h5py.File) -> KeyframeMeta:
         name: str(attrs[name])
         for name in ("task", "env_id", "split", "partition", "code_version", "demos_sha256")
     }
-    return KeyframeMeta(
-        **texts, scene_set=int(attrs["scene_set"]), suites=json.loads(attrs["suites"])
-    )
+    suites = parsed(Mapping[str, Sequence[str]], attrs["suites"])  # type: ignore[type-abstract]
+    return KeyframeMeta(**texts, scene_set=int(attrs["scene_set"]), suites=suites)
 
 
 def _episodes(file: h5py.File) -> list[Episode]:
@@ -397,12 +397,16 @@ def _layout_fault(file: h5py.File) -> str | None:
 def _table_fault(
     file: h5py.File, table: str, columns: Mapping[str, tuple[Any, tuple[int, ...]]]
 ) -> str | None:
+    if strange := sorted(set(file.get(table, ())) - set(columns)):
+        return f"with {table}/{strange[0]}, which no keyframe file has"
     lengths = set()
     for name, (dtype, shape) in columns.items():
         dataset = file.get(f"{table}/{name}")
         if dataset is None:
             return f"without {table}/{name}"
-        if dataset.shape[1:] != shape or dataset.dtype != np.dtype(dtype):
+        if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+            return f"with {table}/{name} that is no table"
+        if dataset.ndim != 1 + len(shape) or dataset.shape[1:] != shape or dataset.dtype != dtype:
             return f"with {table}/{name} of another shape or type"
         lengths.add(len(dataset))
     return f"with {table} of unequal lengths" if len(lengths) > 1 else None

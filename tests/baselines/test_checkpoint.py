@@ -163,10 +163,13 @@ def test_no_state_is_none_and_a_damaged_one_is_named(tmp_path):
     (tmp_path / STATE).write_bytes(b"1234")
     with pytest.raises(UsageError, match=r"train_state\.safetensors is truncated"):
         TrainState.load(tmp_path)
+    plan = '{"steps": 10, "request": {}, "keyframes": {}}'
     for metadata in (
         None,
-        {"progress": "5", "plan": "{}"},
-        {"progress": '{"step": "5", "wall_s": 1, "cpu_s": 1}', "plan": "{}"},
+        {"progress": "5", "plan": plan},
+        {"progress": '{"step": "5", "wall_s": 1, "cpu_s": 1}', "plan": plan},
+        {"progress": '{"step": 11, "wall_s": 1, "cpu_s": 1}', "plan": plan},
+        {"progress": '{"step": 5, "wall_s": 1, "cpu_s": 1}', "plan": "{}"},
     ):
         (tmp_path / STATE).write_bytes(save({"a": torch.ones(1)}, metadata))
         with pytest.raises(UsageError, match="truncated or foreign"):

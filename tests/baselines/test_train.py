@@ -172,14 +172,47 @@ def test_what_does_not_change_is_there_again_after_a_resumption(
             train(*flags)
     (tmp_path / "run" / name).unlink()
     train(*flags, "--resume")
-    assert (tmp_path / "run" / name).read_bytes() == (unbroken / name).read_bytes()
+    found, expected = (load(run, agent="tiny:goals") for run in (tmp_path / "run", unbroken))
+    assert found.identity == expected.identity
+    sentence = "lift the medium block please"
+    assert np.array_equal(found.text[sentence], expected.text[sentence])
+
+
+def test_a_run_is_not_resumed_with_another_text_encoder(data, tmp_path, monkeypatch):
+    flags = (data, tmp_path / "run", "--steps", "12")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(*flags)
+    config = tmp_path / "run" / CONFIG
+    content = json.loads(config.read_text())
+    content["text"]["fingerprint"] = "0" * 64
+    config.write_text(json.dumps(content))
+    with pytest.raises(UsageError, match=r"words by minilm \(0000.*but what this machine has"):
+        train(*flags, "--resume")
+    assert json.loads(config.read_text()) == content
+
+
+@pytest.mark.parametrize("samples", ['"many"', "1e999", "[1]"])
+def test_a_foreign_provenance_beside_weights_is_named(data, tmp_path, unbroken, samples):
+    shutil.copy(unbroken / MODEL, tmp_path / MODEL)
+    (tmp_path / PROVENANCE).write_text(f'{{"samples": {samples}}}')
+    with pytest.raises(UsageError, match=r"provenance\.json is truncated or foreign"):
+        train(data, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "line", ["[]", "{}", '{"kind": "nap", "step": 1}', '{"kind": "train", "step": 1, "loss": "?"}']
+    "line",
+    [
+        "[]",
+        "{}",
+        '{"kind": "val", "step": 1, "all": 5}',
+        '{"kind": "nap", "step": 1}',
+        '{"kind": "train", "step": 1, "loss": "?"}',
+    ],
 )
 def test_a_foreign_metrics_file_is_named(tmp_path, line):
-    good = '{"kind": "val", "step": 1}'
+    good = '{"kind": "val", "step": 1, "all": {"position_mm": 3, "selected_by_words": [1, 2]}}'
     (tmp_path / METRICS).write_text(f"{good}\n{line}\n{line[:2]}")
     with pytest.raises(UsageError, match=r"metrics\.jsonl line 2 is not a line of training"):
         read_rows(tmp_path / METRICS)

@@ -75,7 +75,8 @@ def test_a_value_of_another_type_is_refused(run_folder, changes):
     [
         {"outcome": "SUCCESS", "success": False},
         {"outcome": "MOTOR_FAIL", "success": True},
-        {"success": True, "success_lenient": False},
+        {"success": True, "success_lenient": False, "outcome": "SUCCESS"},
+        {"end": "nap"},
         {"success_lenient": True, "end": "limit"},
         {"outcome": "ERROR", "end": "limit"},
         {"outcome": "TRIUMPH"},

@@ -174,6 +174,16 @@ def _drop_column(file: h5py.File) -> None:
     del file["observations/tcp_in_base"]
 
 
+def _group_for_column(file: h5py.File) -> None:
+    del file["observations/step"]
+    file.create_group("observations/step")
+
+
+def _scalar_for_column(file: h5py.File) -> None:
+    del file["observations/step"]
+    file["observations/step"] = np.int32(1)
+
+
 def _shorten_episodes(file: h5py.File) -> None:
     file["episodes/rows"][0] = 1
 
@@ -188,6 +198,11 @@ def _shorten_episodes(file: h5py.File) -> None:
         (_edit(lambda file: file.attrs.modify("schema_version", 1)), "of schema version 1, not 2"),
         (_edit(_drop_column), "without observations/tcp_in_base"),
         (_edit(_shorten_episodes), "do not add up"),
+        (_edit(lambda file: file.create_group("observations/more/x")), "observations/more, which"),
+        (_edit(_group_for_column), "observations/step that is no table"),
+        (_edit(_scalar_for_column), "of another shape"),
+        (_edit(lambda file: file.attrs.create("suites", 5)), "damaged"),
+        (_edit(lambda file: file.attrs.modify("suites", "[1]")), "damaged"),
         (_edit(lambda file: file.attrs.__delitem__("task")), "damaged"),
     ],
 )
