@@ -80,11 +80,10 @@ def _numbers(hint: Any, value: Any) -> Iterator[tuple[float, Range]]:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         yield value, next(it for it in hint.__metadata__ if isinstance(it, Range))
-    elif origin in UNIONS:
-        alike = [
-            it for it in arguments if (typing.get_origin(it) is tuple) == (type(value) is tuple)
-        ]
-        yield from _numbers(alike[0] if value is not None else None, value)
+    elif origin in UNIONS and value is not None:
+        tuples = isinstance(value, tuple)
+        alike = [it for it in arguments if (typing.get_origin(it) is tuple) == tuples]
+        yield from _numbers(alike[0], value)
     elif origin is tuple:
         kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
         for kind, part in zip(kinds, value, strict=True):
