@@ -1,7 +1,7 @@
 # Each target sets the machine up first; once that is done it costs nothing.
 
 PYTHON := .venv/bin/python
-WORKERS ?= $(shell n=$$(nproc); echo $$((n < 8 ? n : 8)))
+WORKERS ?= $(shell n=$$(env -u OMP_NUM_THREADS nproc); echo $$((n < 8 ? n : 8)))
 AGENT ?= sacil
 export OMP_NUM_THREADS = 1
 
