@@ -17,6 +17,10 @@ from leaderboard.training import Training
 Solves = Callable[[EpisodeKey], bool]
 
 
+SOLVED = {"outcome": "SUCCESS", "success": True, "success_lenient": True, "end": "success"}
+FAILED = {"outcome": "MOTOR_FAIL", "success": False, "success_lenient": False, "end": "limit"}
+
+
 def by_chance(agent: str, rate: float, seed: int = 0) -> Solves:
     """Success by a hash of names: the same on every machine, another for each agent and seed."""
 
@@ -91,14 +95,7 @@ def play(
 
 def _record(entry: Entry, key: EpisodeKey, success: bool, changes: dict) -> EpisodeRecord:  # noqa: FBT001
     identity = entry.identity(key)
-    result = {
-        "outcome": "SUCCESS" if success else "MOTOR_FAIL",
-        "success": success,
-        "success_lenient": success,
-        "end": "success" if success else "limit",
-        "fingerprint": repr(key),
-        "keyframes": 4,
-    }
+    result = (SOLVED if success else FAILED) | {"fingerprint": repr(key), "keyframes": 4}
     return EpisodeRecord(**identity | result | changes)
 
 

@@ -7,7 +7,7 @@ from shutil import copytree
 
 import pytest
 from made_up import make_records
-from played import by_chance, make_training, play, read, rows, tabulate
+from played import FAILED, SOLVED, by_chance, make_training, play, read, rows, tabulate
 
 from leaderboard.layout import SUITES
 from leaderboard.manifest import MANIFEST_FILE
@@ -173,8 +173,8 @@ def test_a_copied_run_counts_once_and_one_that_disagrees_is_refused(runs):
     log = runs / "copy" / EPISODES_FILE
     first, rest = log.read_text().split("\n", 1)
     record = json.loads(first)
-    record["success"] = not record["success"]
-    log.write_text(json.dumps(record) + "\n" + rest)
+    verdict = FAILED if record["success"] else SOLVED
+    log.write_text(json.dumps(record | verdict) + "\n" + rest)
     with pytest.raises(UsageError, match=r"copy and .*rvt hold episode .* different results"):
         tabulate(runs)
 
@@ -250,7 +250,8 @@ def test_an_agent_of_unknown_budget_is_shown_apart_or_not_at_all(runs):
 
 def test_a_reader_is_told_of_missing_and_broken_episodes_and_of_repeated_tests(runs):
     training = make_training("act3d")
-    folder = play(runs / "act3d", "act3d", training=training, episodes=9, end="error")
+    broken = FAILED | {"outcome": "ERROR", "end": "error"}
+    folder = play(runs / "act3d", "act3d", training=training, episodes=9, **broken)
     path = folder / MANIFEST_FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | {"test_runs": 2}))
     note = rows(tabulate(runs))["act3d"]["note"]
@@ -314,7 +315,7 @@ def mix_protocols(folder: Path) -> None:
         (drop_manifest, "has no manifest.json beside it"),
         (drop_episodes, "is half a run"),
         (spoil_manifest, "manifest.json is not the manifest"),
-        (spoil_training, "manifest.json is not the manifest .*training facts"),
+        (spoil_training, r"manifest.json is not the manifest .*training\."),
         (mix_agents, "line 91 is not of the run in manifest.json: its agent differs"),
         (mix_protocols, "line 1 is not of the run in manifest.json: its protocol differs"),
     ],
