@@ -110,8 +110,8 @@ class Network(nn.Module):
     sight: Sight
     """What it reads of a scene."""
 
-    needs_goals: bool = False
-    """Whether `loss` reads `Batch.goal`."""
+    goal_sight: Sight | None = None
+    """What `loss` reads of `Batch.goal`; None if it reads no goals."""
 
     @property
     def device(self) -> torch.device:

@@ -63,10 +63,6 @@ class Batch(Generic[Scene]):
     inputs: Inputs[Scene]
     labels: Labels
 
-    goal: Scene | None
-    """The observation at the keyframe to be reached, with its own augmentation; None unless the
-    network asks for goals."""
-
     task: Int64[Tensor, "b"]
     """Index of the task in the training set."""
 
@@ -78,6 +74,10 @@ class Batch(Generic[Scene]):
 
     first: Bool[Tensor, "b"]
     """True at the first keyframe of a demonstration (the arm is still at home)."""
+
+    goal: Any = None
+    """The observation at the keyframe to be reached, with its own augmentation, as the network's
+    `goal_sight` shows it; None unless it asks for goals."""
 
 
 @dataclass(frozen=True)

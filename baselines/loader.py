@@ -4,6 +4,7 @@ Runs on the training thread: on one core a second thread would win nothing.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -33,15 +34,15 @@ class Loader:
         sight: Sight,
         recipe: Recipe,
         seed: int,
-        goals: bool,
+        goal_sight: Sight | None = None,
     ) -> None:
-        """`goals` asks for the observation that each sample leads to."""
+        """`goal_sight` looks at the observation that each sample leads to."""
         self.keyframes = keyframes
         self._text = text
         self._sight = sight
         self._recipe = recipe
         self._seed = seed
-        self._goals = goals
+        self._goal_sight = goal_sight
         sentences = {e.instruction for shard in keyframes.shards for e in shard.episodes}
         self._text_length = max(len(text[sentence]) for sentence in sentences)
 
@@ -55,8 +56,11 @@ class Loader:
         rng = stream(self._seed, step, "rows")
         samples = self.keyframes.draw(rng, self._recipe.batch, self._recipe.choice_share)
         own, shown = share(len(samples)), self._moved(samples, step, "moves")
-        goals = self._moved(self._next(samples), step, "goals")[own] if self._goals else None
-        return self._assemble(samples[own], shown[own], goals)
+        batch = self._assemble(samples[own], shown[own])
+        if self._goal_sight is None:
+            return batch
+        goals = self._moved(self._next(samples), step, "goals")
+        return replace(batch, goal=self._goal_sight.look(goals[own]))
 
     def plain(self, samples: Sequence[Sample]) -> Batch:
         """A batch of these samples without augmentation or goals."""
@@ -64,7 +68,7 @@ class Loader:
             Moment(self.keyframes.shards[s.shard].observation(s.row), before=self._before(s))
             for s in samples
         ]
-        return self._assemble(samples, moments, None)
+        return self._assemble(samples, moments)
 
     def _moved(self, samples: Sequence[Sample], step: int, name: str) -> list[Moment]:
         """Each sample with a move of its own; `name` is the stream that it is drawn from."""
@@ -86,9 +90,7 @@ class Loader:
         shards = self.keyframes.shards
         return [Sample(s.shard, int(shards[s.shard].columns["next_index"][s.row])) for s in samples]
 
-    def _assemble(
-        self, samples: Sequence[Sample], moments: Sequence[Moment], goals: list[Moment] | None
-    ) -> Batch:
+    def _assemble(self, samples: Sequence[Sample], moments: Sequence[Moment]) -> Batch:
         keyframes, shards = self.keyframes, self.keyframes.shards
         episodes = [keyframes.episode(sample) for sample in samples]
         trajectories = [s.shard << 32 | e for s, e in zip(samples, episodes, strict=True)]
@@ -98,7 +100,6 @@ class Loader:
         return Batch(
             inputs=self._inputs(samples, moments),
             labels=self._labels(samples, moments),
-            goal=None if goals is None else self._sight.look(goals),
             task=torch.tensor([sample.shard for sample in samples]),
             meaning=torch.tensor([keyframes.meaning_ids[keyframes.meaning(s)] for s in samples]),
             trajectory=torch.tensor(trajectories),

@@ -74,7 +74,7 @@ class Material:
             sight=network.sight,
             recipe=self.job.config.recipe,
             seed=seed,
-            goals=network.needs_goals,
+            goal_sight=network.goal_sight,
         )
         return Trainer(network, loader, self.job.config.recipe, steps=steps, seed=seed)
 
@@ -98,7 +98,6 @@ class Material:
             sight=sight,
             recipe=recipe,
             seed=0,
-            goals=False,
         )
         return partial(validate, loader=loader)
 

@@ -54,10 +54,14 @@ def multiply(
     first: Float[np.ndarray, "*#b 4"], second: Float[np.ndarray, "*#b 4"]
 ) -> Float[np.ndarray, "*#b 4"]:
     """Hamilton product: the rotation `second`, then `first`, both about fixed axes."""
-    w, v = first[..., :1], first[..., 1:]
-    s, u = second[..., :1], second[..., 1:]
-    scalar = w * s - (v * u).sum(-1, keepdims=True)
-    return np.concatenate([scalar, w * u + s * v + np.cross(v, u)], axis=-1)
+    (w, x, y, z), (a, b, c, d) = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
+    parts = [
+        w * a - (x * b + y * c + z * d),
+        w * b + a * x + (y * d - z * c),
+        w * c + a * y + (z * b - x * d),
+        w * d + a * z + (x * c - y * b),
+    ]
+    return np.stack(parts, axis=-1)
 
 
 def canonical_yaw(quaternion_wxyz: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 4"]:

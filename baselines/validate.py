@@ -81,7 +81,6 @@ def main(config: ValidateConfig) -> None:
         sight=trained.network.sight,
         recipe=trained.identity.config.recipe,
         seed=0,
-        goals=False,
     )
     for name, scores in validate(trained.network, loader).items():
         if "/" not in name:

@@ -269,9 +269,9 @@ def make_batch(network: Network, size: int) -> Batch:
         gripper_open=index % 2,
         ignore_collisions=index % 2,
     )
-    goal = network.sight.look(moments) if network.needs_goals else None
+    goal = None if network.goal_sight is None else network.goal_sight.look(moments)
     inputs = inputs_of(network.sight, moments, words, mask)
-    return Batch(inputs, labels, goal, index, index, index, index % 2 == 0)
+    return Batch(inputs, labels, index, index, index, index % 2 == 0, goal)
 
 
 def learn(network: Network, batch: Batch) -> dict[str, Tensor]:

@@ -61,7 +61,7 @@ def tiny(config: Any) -> Any:
     return replace(config, **sizes, recipe=replace(config.recipe, precision="fp32"))
 
 
-def make_batch(sight: Sight, *, size: int = 4, goals: bool = True, seed: int = 0) -> Batch:
+def make_batch(sight: Sight, *, size: int = 4, goals: Sight | None = None, seed: int = 0) -> Batch:
     """A random batch: two tasks with sizes by turns; sentences of 2 to 6 tokens.
 
     Where to go is red, the rest is grey noise.
@@ -80,11 +80,11 @@ def make_batch(sight: Sight, *, size: int = 4, goals: bool = True, seed: int = 0
             gripper_open=torch.tensor(rng.integers(2, size=size)),
             ignore_collisions=torch.tensor(rng.integers(2, size=size)),
         ),
-        goal=sight.look(random_moments(size, seed + 1)) if goals else None,
         task=task,
         meaning=3 * task + slot,
         trajectory=index,
         first=index % 3 == 0,
+        goal=None if goals is None else goals.look(random_moments(size, seed + 1)),
     )
 
 

@@ -113,7 +113,7 @@ class Tiny(Network):
     def __init__(self, config: TinyConfig, text: TextSpec) -> None:
         super().__init__()
         self.sight = ViewSight(config.pixels)
-        self.needs_goals = config.goals
+        self.goal_sight = self.sight if config.goals else None
         self.dropout = nn.Dropout(config.dropout)
         self.position = nn.Linear(5 * 7 + 2 + text.dim, 3)
 

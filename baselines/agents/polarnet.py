@@ -27,7 +27,8 @@ from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
 from baselines.layers.regression import POSE, UNTURNED, Regressed, tool_axes
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud, Pyramid
+from baselines.scene.neighbours import Pyramid
+from baselines.scene.points import HALF_SIDE_M, CloudSight, PointCloud
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
 

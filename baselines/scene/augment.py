@@ -6,6 +6,7 @@ symmetry: pass it through `rotation.canonical_yaw`.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -45,7 +46,7 @@ class Augmentation:
     shift_m: Float64[np.ndarray, "3"]
     """Where the base origin ends up."""
 
-    @property
+    @cached_property
     def matrix(self) -> Float64[np.ndarray, "3 4"]:
         """Affine map base to base."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)

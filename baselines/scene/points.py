@@ -18,9 +18,9 @@ from torch import Tensor
 
 from baselines.scene.cloud import point_maps
 from baselines.scene.compiled import compiled
+from baselines.scene.neighbours import Pyramid, farthest_first, near_points, nearest_three
 from baselines.scene.sight import STILL, Moment, gripper_in_cube
 from baselines.scene.views import cube_from_base
-from sacil_tasks.errors import UsageError
 from sacil_tasks.interface import SCENE_BOUNDS, Observation
 
 TABLE_M = 0.003
@@ -33,59 +33,14 @@ SMOOTH_M = 0.02
 FRACTION = 2**20
 """Sums over a voxel count in these parts of one, which makes them exact in any order."""
 
-PARENTS = 3
-"""Coarse points that a finer one is interpolated from."""
-
-TAKEN = np.float32(-1)
-"""Gap of a point that has its place in the order."""
-
-LOW_BITS = 2**32 - 1
+DIGIT_BITS = 12
+DIGIT = 2**DIGIT_BITS - 1
+"""Cells are sorted by digits of so many bits."""
 
 COLUMNS = 9
 """Of a row of a cloud: position in the cube, colour (0 to 255), normal."""
 
 HALF_SIDE_M = SCENE_BOUNDS.side_m / 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pyramid:
-    """How a cloud is thinned out, stage by stage."""
-
-    voxel_m: float
-    """Edge of the cells in which points are averaged."""
-
-    points: int
-    """Points that enter the network; a smaller cloud is repeated, a larger one drawn from."""
-
-    stages: tuple[int, ...]
-    """Points that each stage keeps, falling."""
-
-    radius: float
-    """Reach of the first stage's neighbourhoods, as a share of the cloud's."""
-
-    growth: float
-    """Factor from one stage's radius to the next one's."""
-
-    neighbours: int
-    """Points that a neighbourhood counts."""
-
-    def __post_init__(self) -> None:
-        """Check that stages fall.
-
-        Raises:
-            UsageError: a stage keeps more points than there are.
-        """
-        counts = (self.points, *self.stages)
-        if list(counts) != sorted(counts, reverse=True) or counts[-1] < 1:
-            raise UsageError(
-                f"stages of {self.stages} points cannot be taken from {self.points}: each keeps "
-                "some of the one before. Change --points or --stages."
-            )
-
-    @property
-    def radii(self) -> tuple[float, ...]:
-        """Reach of each stage's neighbourhoods."""
-        return tuple(self.radius * self.growth**stage for stage in range(len(self.stages)))
 
 
 @dataclass(frozen=True)
@@ -139,10 +94,9 @@ class CloudSight:
         if not len(voxels):  # nothing to be seen: a black point where the gripper is
             voxels = np.zeros((1, COLUMNS), np.float32)
             voxels[0, :3] = gripper
-        offsets = voxels[:, :3] - gripper
-        reach = np.float32(np.linalg.norm(offsets, axis=1).max()) or np.float32(1)
+        reach = np.float32(_reach(voxels, gripper) or 1)
         chosen = np.random.default_rng(moment.seed).permutation(len(voxels))[: self.pyramid.points]
-        xyz = offsets[chosen] / reach
+        xyz = (voxels[chosen, :3] - gripper) / reach
         order = farthest_first(xyz, min(self.pyramid.stages[0], len(xyz)))
         return self._placed(moment, voxels[chosen[order]], xyz[order], reach)
 
@@ -182,46 +136,17 @@ def average(rows: Float32[np.ndarray, "n 9"], cell: float) -> Float32[np.ndarray
 
     The answer does not depend on the order of the rows, to the last bit.
     """
-    return _means(rows, np.sort(_cells(rows, np.float32(cell))))
+    return _means(rows, *_by_cell(_cells(rows, np.float32(cell))))
 
 
-def farthest_first(xyz: Float32[np.ndarray, "n 3"], count: int) -> Int32[np.ndarray, "n"]:
-    """An order in which each of the first `count` points is the farthest from those before it.
-
-    It begins with point 0, and ends with the points not chosen, in the order they came.
-    """
-    return _farthest_first(np.ascontiguousarray(xyz.T), count)
-
-
-def near_points(xyz: Float32[np.ndarray, "n 3"], pyramid: Pyramid) -> Int32[np.ndarray, "r k"]:
-    """For each centre of each stage, the first points within its radius in the stage before.
-
-    With the farthest first, the first points are those that spread over the neighbourhood
-    (D-polarnet-ball).
-    """
-    near = np.empty((sum(pyramid.stages), pyramid.neighbours), np.int32)
-    axes = np.ascontiguousarray(xyz.T)
-    start, before = 0, pyramid.points
-    for count, radius in zip(pyramid.stages, pyramid.radii, strict=True):
-        _first_in_balls(axes, before, np.float32(radius**2), near[start : start + count])
-        start, before = start + count, count
-    return near
-
-
-def nearest_three(
-    xyz: Float32[np.ndarray, "n 3"], pyramid: Pyramid
-) -> tuple[Int32[np.ndarray, "u 3"], Float32[np.ndarray, "u 3"]]:
-    """Parents of each point that a stage drops, and weights by inverse distance."""
-    dropped = pyramid.points - pyramid.stages[-1]
-    parents = np.empty((dropped, PARENTS), np.int32)
-    shares = np.empty((dropped, PARENTS), np.float32)
-    axes = np.ascontiguousarray(xyz.T)
-    before = pyramid.points
-    for count in pyramid.stages:
-        part = slice(count - pyramid.stages[-1], before - pyramid.stages[-1])
-        _three_nearest(axes, count, parents[part], shares[part])
-        before = count
-    return parents, shares
+@compiled
+def _reach(rows: np.ndarray, center: np.ndarray) -> np.float32:
+    """Distance of the farthest row from a point."""
+    squared = np.float32(0)
+    for i in range(len(rows)):
+        x, y, z = rows[i, 0] - center[0], rows[i, 1] - center[1], rows[i, 2] - center[2]
+        squared = max(squared, x * x + y * y + z * z)
+    return np.sqrt(squared)
 
 
 @compiled
@@ -234,180 +159,118 @@ def _collect(
 ) -> int:
     """Write the rows and return how many there are."""
     _, height, width = inside.shape
+    beside = np.zeros((height, width + 1), np.bool_)
+    below = np.zeros((height + 1, width), np.bool_)
     count = 0
     for k in range(len(maps)):
+        image, shown = maps[k], inside[k]
+        for i in range(height):
+            start, end = image[:, i, :-1], image[:, i, 1:]
+            _continues(start, end, shown[i, :-1], shown[i, 1:], beside[i, 1:-1])
+        for i in range(height - 1):
+            _continues(image[:, i], image[:, i + 1], shown[i], shown[i + 1], below[i + 1])
         for i in range(height):
             for j in range(width):
-                if not inside[k, i, j] or maps[k, 2, i, j] <= floor:
+                if not shown[i, j] or image[2, i, j] <= floor:
                     continue
                 for c in range(3):
-                    rows[count, c] = maps[k, c, i, j]
+                    rows[count, c] = image[c, i, j]
                     rows[count, 3 + c] = rgb[k, i, j, c]
-                _normal(maps[k], inside[k], i, j, rows[count, 6:])
+                left, right = j - beside[i, j], j + beside[i, j + 1]
+                above, under = i - below[i, j], i + below[i + 1, j]
+                _normal(image, i, j, left, right, above, under, rows[count, 6:])
                 count += 1
     return count
 
 
 @compiled
-def _normal(maps: np.ndarray, inside: np.ndarray, i: int, j: int, out: np.ndarray) -> None:
+def _continues(
+    start: np.ndarray,
+    end: np.ndarray,
+    start_seen: np.ndarray,
+    end_seen: np.ndarray,
+    smooth: np.ndarray,
+) -> None:
+    """Whether each pixel of a row and its neighbour in the next one are of one surface."""
+    limit = np.float32((SMOOTH_M / HALF_SIDE_M) ** 2)
+    for j in range(len(smooth)):
+        x, y, z = start[0, j] - end[0, j], start[1, j] - end[1, j], start[2, j] - end[2, j]
+        smooth[j] = start_seen[j] & end_seen[j] & (x * x + y * y + z * z < limit)
+
+
+@compiled
+def _normal(
+    maps: np.ndarray,
+    i: int,
+    j: int,
+    left: int,
+    right: int,
+    above: int,
+    below: int,
+    out: np.ndarray,
+) -> None:
     """Unit normal towards the camera from the pixel's neighbours; 0 where there is none
     (D-polarnet-normals)."""
-    height, width = inside.shape
-    left = j - 1 if j > 0 and _smooth(maps, inside, i, j, i, j - 1) else j
-    right = j + 1 if j + 1 < width and _smooth(maps, inside, i, j, i, j + 1) else j
-    above = i - 1 if i > 0 and _smooth(maps, inside, i, j, i - 1, j) else i
-    below = i + 1 if i + 1 < height and _smooth(maps, inside, i, j, i + 1, j) else i
     ux = maps[0, i, right] - maps[0, i, left]
     uy = maps[1, i, right] - maps[1, i, left]
     uz = maps[2, i, right] - maps[2, i, left]
     vx = maps[0, below, j] - maps[0, above, j]
     vy = maps[1, below, j] - maps[1, above, j]
     vz = maps[2, below, j] - maps[2, above, j]
-    out[0], out[1], out[2] = vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux
-    length = np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    if length > 0:
-        out /= length
-
-
-@compiled
-def _smooth(maps: np.ndarray, inside: np.ndarray, i: int, j: int, row: int, column: int) -> bool:
-    """Whether a neighbouring pixel continues the surface."""
-    if not inside[row, column]:
-        return False
-    squared = np.float32(0)
-    for c in range(3):
-        squared += (maps[c, row, column] - maps[c, i, j]) ** 2
-    return bool(squared < np.float32((SMOOTH_M / HALF_SIDE_M) ** 2))
+    nx, ny, nz = vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    scale = length if length > 0 else np.float32(1)
+    out[0], out[1], out[2] = nx / scale, ny / scale, nz / scale
 
 
 @compiled
 def _cells(rows: np.ndarray, cell: np.float32) -> np.ndarray:
-    """The cell of each row as one number, and the row's own number in the low bits.
-
-    Sorted they list the rows cell by cell; NumPy sorts numbers far faster than it ranks them.
-    """
+    """The cell of each row as one number."""
     side = np.int64(2 / cell) + 2
-    keys = np.empty(len(rows), np.int64)
+    cells = np.empty(len(rows), np.int64)
     for i in range(len(rows)):
         key = np.int64(0)
         for axis in range(3):
             key = key * side + np.int64((rows[i, axis] + np.float32(1)) / cell)
-        keys[i] = key << 32 | i
-    return keys
+        cells[i] = key
+    return cells
 
 
 @compiled
-def _means(rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Mean of the rows of each cell, whose keys are sorted."""
+def _by_cell(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows' numbers in the order of their cells, and those cells: one pass of counting for
+    each digit, the lowest first, is several times as fast as NumPy's sort."""
+    order, ordered = np.arange(len(cells), dtype=np.int32), cells.copy()
+    other, others = np.empty_like(order), np.empty_like(ordered)
+    shift, last = 0, cells.max() if len(cells) else 0
+    while last >> shift:
+        starts = np.zeros(DIGIT + 2, np.int32)
+        for cell in ordered:
+            starts[(cell >> shift & DIGIT) + 1] += 1
+        for digit in range(DIGIT):
+            starts[digit + 1] += starts[digit]
+        for i in range(len(cells)):
+            digit = ordered[i] >> shift & DIGIT
+            other[starts[digit]], others[starts[digit]] = order[i], ordered[i]
+            starts[digit] += 1
+        order, other, ordered, others = other, order, others, ordered
+        shift += DIGIT_BITS
+    return order, ordered
+
+
+@compiled
+def _means(rows: np.ndarray, order: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Mean of the rows of each cell; `order` lists them cell by cell."""
     means = np.empty(rows.shape, np.float32)
     sums = np.zeros(rows.shape[1], np.int64)
     runs, start = 0, 0
-    for i in range(len(keys)):
-        row = keys[i] & LOW_BITS
+    for i in range(len(order)):
+        row = order[i]
         for c in range(len(sums)):
             sums[c] += np.int64(np.rint(rows[row, c] * np.float64(FRACTION)))
-        if i + 1 == len(keys) or keys[i + 1] >> 32 != keys[i] >> 32:
+        if i + 1 == len(order) or cells[i + 1] != cells[i]:
             for c in range(len(sums)):
                 means[runs, c] = sums[c] / (np.float64(FRACTION) * (i + 1 - start))
                 sums[c] = 0
             runs, start = runs + 1, i + 1
     return means[:runs]
-
-
-@compiled
-def _farthest_first(xyz: np.ndarray, count: int) -> np.ndarray:
-    points = xyz.shape[1]
-    gaps = np.full(points, np.float32(np.inf))
-    order = np.empty(points, np.int32)
-    latest = 0
-    for taken in range(count):
-        order[taken] = latest
-        _shrink(xyz[0], xyz[1], xyz[2], latest, gaps)
-        gaps[latest] = TAKEN
-        latest = _widest(gaps.view(np.int32))
-    rest = count
-    for i in range(points):
-        if gaps[i] != TAKEN:
-            order[rest] = i
-            rest += 1
-    return order
-
-
-@compiled
-def _first_in_balls(xyz: np.ndarray, before: int, squared: np.float32, near: np.ndarray) -> None:
-    """Fill one stage's neighbourhoods; the first neighbour fills what is left over."""
-    points = xyz.shape[1]
-    gaps = np.empty(min(before, points), np.float32)
-    for row in range(len(near)):
-        _squared(xyz[0], xyz[1], xyz[2], row % points, gaps)
-        found = 0
-        for i in range(len(gaps)):
-            if gaps[i] <= squared:
-                near[row, found] = i
-                found += 1
-                if found == near.shape[1]:
-                    break
-        near[row, found:] = near[row, 0]
-
-
-@compiled
-def _three_nearest(xyz: np.ndarray, count: int, parents: np.ndarray, shares: np.ndarray) -> None:
-    """Fill the parents of the points from `count` on among the first `count`.
-
-    Where there are fewer than three, the nearest is named again, with no share.
-    """
-    points = xyz.shape[1]
-    gaps = np.empty(min(count, points), np.float32)
-    for row in range(len(parents)):
-        _squared(xyz[0], xyz[1], xyz[2], (count + row) % points, gaps)
-        key = np.int64(-1)
-        for rank in range(PARENTS):
-            key = _next_nearest(gaps.view(np.int32), key)
-            parent = key & LOW_BITS if rank < len(gaps) else parents[row, 0]
-            share = np.float32(1) / (np.sqrt(gaps[parent]) + np.float32(1e-8))
-            parents[row, rank] = parent
-            shares[row, rank] = share if rank < len(gaps) else np.float32(0)
-        shares[row] /= shares[row].sum()
-
-
-# The loops below are functions of contiguous arrays because LLVM then turns them into vector
-# instructions. The bits of floats that are not negative are integers of the same order, and with
-# the index beside them one minimum finds both; minima of integers vectorise, those of floats with
-# their index do not.
-
-
-@compiled
-def _squared(x: np.ndarray, y: np.ndarray, z: np.ndarray, point: int, gaps: np.ndarray) -> None:
-    """Squared distances from one point to as many first points as there are gaps."""
-    px, py, pz = x[point], y[point], z[point]
-    for i in range(len(gaps)):
-        gaps[i] = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
-
-
-@compiled
-def _shrink(x: np.ndarray, y: np.ndarray, z: np.ndarray, point: int, gaps: np.ndarray) -> None:
-    """Lower each point's squared gap to what is taken, now that `point` is."""
-    px, py, pz = x[point], y[point], z[point]
-    for i in range(len(gaps)):
-        gap = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
-        gaps[i] = min(gaps[i], gap)
-
-
-@compiled
-def _widest(bits: np.ndarray) -> int:
-    """Index of the greatest float, the first one of equals; `bits` are those of the floats."""
-    best = np.int64(-(2**63))
-    for i in range(len(bits)):
-        best = max(best, (np.int64(bits[i]) << 32) - i)
-    return int(-best & LOW_BITS)
-
-
-@compiled
-def _next_nearest(bits: np.ndarray, after: int) -> int:
-    """The least key above `after`; a key is the float's bits, then its index."""
-    none = np.int64(2**63 - 1)
-    best = none
-    for i in range(len(bits)):
-        key = (np.int64(bits[i]) << 32) | i
-        best = min(best, key if key > after else none)
-    return int(best)

@@ -19,6 +19,7 @@ from baselines.scene.views import (
     CHANNELS,
     THREE_VIEWS,
     VIEWS,
+    View,
     apply_affine,
     cube_from_base,
     render_views,
@@ -86,21 +87,22 @@ class Views:
 
 
 class ViewSight:
-    """Draws the five virtual views."""
+    """Draws virtual views, by default RVT's five."""
 
     remembers = False
 
-    def __init__(self, pixels: int) -> None:
+    def __init__(self, pixels: int, shown: tuple[View, ...] = VIEWS) -> None:
         """Views of `pixels` a side."""
         self.pixels = pixels
+        self.shown = shown
 
     def look(self, moments: Sequence[Moment]) -> Views:
         """Unproject, move and draw each scene."""
-        shape = (len(VIEWS), len(CHANNELS), self.pixels, self.pixels)
+        shape = (len(self.shown), len(CHANNELS), self.pixels, self.pixels)
         views = np.empty((len(moments), *shape), np.float32)
         for moment, out in zip(moments, views, strict=True):
-            cloud = _cloud(moment.seen)
-            render_views(cloud.xyz_in_base, cloud.rgb, moment.move.to_cube(), self.pixels, out)
+            cloud, move = _cloud(moment.seen), moment.move.to_cube()
+            render_views(cloud.xyz_in_base, cloud.rgb, move, self.pixels, out, self.shown)
         return Views(torch.from_numpy(views))
 
 

@@ -66,12 +66,18 @@ bits free for the index of the point, and the sum of both is exact in a float64.
 
 NOTHING = np.inf
 
+SHADES = (np.arange(256) / np.float32(255)).astype(np.float32)
+"""Each colour value as a share of one."""
 
+
+@cache
 def cube_from_base(bounds: SceneBounds = SCENE_BOUNDS) -> Float32[np.ndarray, "3 4"]:
     """Affine map from the base frame (m) to cube coordinates."""
     scale = 2.0 / bounds.side_m
     shift = -scale * np.asarray(bounds.center_in_base)
-    return np.column_stack([scale * np.eye(3), shift]).astype(np.float32)
+    transform = np.column_stack([scale * np.eye(3), shift]).astype(np.float32)
+    transform.flags.writeable = False  # every caller gets the same array
+    return transform
 
 
 def apply_affine(
@@ -140,46 +146,45 @@ def _render(
     xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, table: np.ndarray, out: np.ndarray
 ) -> None:
     pixels = out.shape[2]
-    points = np.empty((len(xyz), 6), np.float32)
-    cells = np.empty((len(xyz), 3), np.int32)
-    count = _place(xyz, rgb, transform, pixels, points, cells)
+    points = np.empty((len(xyz), 4), np.float32)
+    cells = np.empty((len(xyz), 4), np.int16)
+    count = _place(xyz, rgb, transform, points)
     points, cells = points[:count], cells[:count]
-    nearest = np.empty((pixels + 2, pixels + 2, 2), np.float64)
+    _first_cells(points.ravel(), np.float32(pixels / 2), cells.ravel())
+    nearest = np.empty((pixels + 1, pixels + 1, 2), np.float64)
     for k in range(len(table)):
         u_axis, u_sign, v_axis, depth_axis, side = table[k]
         if k == 0 or depth_axis != table[k - 1, 3]:
             _splat(points, cells, u_axis, v_axis, depth_axis, nearest)
-        _paint(points, nearest[:, :, int(side < 0)], depth_axis, side, u_sign, out[k])
+        seen = nearest[:, :, int(side < 0)]
+        _paint(points, seen, depth_axis, side, u_sign, out[k])
 
 
 @compiled
-def _place(
-    xyz: np.ndarray,
-    rgb: np.ndarray,
-    transform: np.ndarray,
-    pixels: int,
-    points: np.ndarray,
-    cells: np.ndarray,
-) -> int:
-    """Keep the points inside the cube: their features and the first cell each covers per axis.
-
-    Cells are counted from 0 for the margin outside the cube, so both cells of a point exist.
-    """
-    half, one = np.float32(pixels / 2), np.float32(1)
+def _place(xyz: np.ndarray, rgb: np.ndarray, transform: np.ndarray, points: np.ndarray) -> int:
+    """Keep the points inside the cube, their colours packed behind them; returns how many."""
+    one, bits = np.float32(1), points.view(np.int32)
     count = 0
     for i in range(len(xyz)):
         px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         x = transform[0, 0] * px + transform[0, 1] * py + transform[0, 2] * pz + transform[0, 3]
         y = transform[1, 0] * px + transform[1, 1] * py + transform[1, 2] * pz + transform[1, 3]
         z = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2] * pz + transform[2, 3]
-        if not (abs(x) <= one and abs(y) <= one and abs(z) <= one):
-            continue
-        points[count, 0], points[count, 1], points[count, 2] = x, y, z
-        for c in range(3):
-            points[count, 3 + c] = np.float32(rgb[i, c]) / np.float32(255)
-            cells[count, c] = np.int32(half * (one + points[count, c]) + np.float32(0.5))
-        count += 1
+        if abs(x) <= one and abs(y) <= one and abs(z) <= one:
+            points[count, 0], points[count, 1], points[count, 2] = x, y, z
+            bits[count, 3] = rgb[i, 0] | np.int32(rgb[i, 1]) << 8 | np.int32(rgb[i, 2]) << 16
+            count += 1
     return count
+
+
+@compiled
+def _first_cells(coordinates: np.ndarray, half: np.float32, cells: np.ndarray) -> None:
+    """The first of the two cells that a point covers along each axis.
+
+    Cells are counted from 0 for the margin outside the cube, so both cells of a point exist.
+    """
+    for i in range(len(coordinates)):
+        cells[i] = np.int16(half * (np.float32(1) + coordinates[i]) + np.float32(0.5))
 
 
 @compiled
@@ -196,6 +201,9 @@ def _splat(
     An entry is depth followed by the point's index, so that the smaller entry is the nearer point
     and, on equal depth, the earlier one. Taking the minimum needs no branch to be guessed, and
     64-bit floats have one instruction for it.
+
+    A point covers its first cell and the next one along both axes, but is entered in the first
+    only: `_paint` looks at the four from which a cell is reached.
     """
     nearest[:] = NOTHING
     one = np.float32(1)
@@ -204,10 +212,8 @@ def _splat(
         plus = np.float64(one - along) * DEPTH_SCALE + i
         minus = np.float64(one + along) * DEPTH_SCALE + i
         row, column = cells[i, row_axis], cells[i, column_axis]
-        for r in range(row, row + 2):
-            for c in range(column, column + 2):
-                nearest[r, c, 0] = min(nearest[r, c, 0], plus)
-                nearest[r, c, 1] = min(nearest[r, c, 1], minus)
+        nearest[row, column, 0] = min(nearest[row, column, 0], plus)
+        nearest[row, column, 1] = min(nearest[row, column, 1], minus)
 
 
 @compiled
@@ -223,20 +229,22 @@ def _paint(
     view[:6] = 0
     view[6] = EMPTY_DEPTH
     pixels = view.shape[1]
-    total, covered = 0.0, 0
+    total, covered, colours = 0.0, 0, points.view(np.int32)
     for v in range(pixels):
+        above, below = nearest[pixels - v - 1], nearest[pixels - v]
         for u in range(pixels):
-            entry = nearest[pixels - v, u + 1 if u_sign > 0 else pixels - u]
+            left = u if u_sign > 0 else pixels - 1 - u
+            entry = min(min(above[left], above[left + 1]), min(below[left], below[left + 1]))
             if entry == NOTHING:
                 continue
             i = np.int64(entry) & ((1 << INDEX_BITS) - 1)
-            for c in range(6):
+            for c in range(3):
                 view[c, v, u] = points[i, c]
+                view[3 + c, v, u] = SHADES[colours[i, 3] >> 8 * c & 255]
             view[6, v, u] = np.float32(1) - np.float32(side) * points[i, depth_axis]
             total += view[6, v, u]
             covered += 1
     mean = np.float32(total / max(covered, 1))
-    for v in range(pixels):
+    for row in view[6]:
         for u in range(pixels):
-            if nearest[pixels - v, u + 1 if u_sign > 0 else pixels - u] != NOTHING:
-                view[6, v, u] -= mean
+            row[u] -= mean if row[u] != EMPTY_DEPTH else np.float32(0)

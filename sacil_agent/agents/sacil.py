@@ -139,7 +139,7 @@ class Sacil(Network):
         if config.image_text_weight > 0:
             self.image_text = Contrast(width, width, width)
         if config.current_goal_weight > 0:
-            self.needs_goals = True
+            self.goal_sight = self.sight
             self.goal_position = positions(config, config.stem_channels)
             self.current_goal = Contrast(width, len(VIEWS) * width, width)
 
@@ -202,7 +202,7 @@ class Sacil(Network):
             loss, cosines = self.image_text(seen.image, seen.sentence, same)
             total = total + self.config.image_text_weight * loss
             terms |= {"itc/loss": loss.detach(), **diagnostics("itc", cosines, batch)}
-        if batch.goal is not None and self.needs_goals:
+        if batch.goal is not None and self.goal_sight is not None:
             goals = self.goal_features(roughened(batch.goal, recipe.image_noise))
             loss, cosines = self.current_goal(seen.situation, goals, same)
             total = total + self.config.current_goal_weight * loss

@@ -25,7 +25,7 @@ from baselines.batch import Batch
 from baselines.layers.attention import mlp
 from baselines.layers.multiview import last_token, positions, roughened, within_views
 from baselines.policy import KeyframePolicy, load_policy
-from baselines.scene.sight import Views, ZoomScene
+from baselines.scene.sight import Views, ViewSight, ZoomScene
 from baselines.text import TextSpec
 from sacil_agent.contrast import Contrast, diagnostics, same_meaning
 
@@ -49,12 +49,11 @@ PAPER = SacilRvt2Config(**vars(RVT2_PAPER))
 class SacilRvt2(Rvt2):
     """RVT-2 whose coarse stage is contrasted with the sentence and with the goal."""
 
-    needs_goals = True
-
     def __init__(self, config: SacilRvt2Config, text: TextSpec) -> None:
         """Fresh weights; `text` says how wide a token vector is."""
         super().__init__(config, text)
         self.config: SacilRvt2Config = config
+        self.goal_sight = ViewSight(config.pixels, config.views)
         width = config.width
         self.sentence = mlp((text.dim, width, width))
         self.image_text = Contrast(width, width, width)

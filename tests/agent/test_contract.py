@@ -39,7 +39,7 @@ def network(name: str, config: Any) -> Network:
 
 
 def batch_for(network: Network, **options: int) -> Batch:
-    return make_batch(network.sight, goals=network.needs_goals, **options)
+    return make_batch(network.sight, goals=network.goal_sight, **options)
 
 
 def assert_same(first: Prediction, second: Prediction, tolerance: float = 0.0) -> None:
@@ -85,7 +85,7 @@ def test_every_parameter_is_taught(network: Network) -> None:
 def test_the_loss_is_finite_where_there_is_nothing_to_see(network: Network, points: int) -> None:
     batch = batch_for(network)
     blank = network.sight.look(blank_moments(4, points))
-    goal = None if batch.goal is None else blank
+    goal = None if batch.goal is None else network.goal_sight.look(blank_moments(4, points))
     batch = replace(batch, inputs=replace(batch.inputs, scene=blank), goal=goal)
     loss, _ = network.loss(batch)
     loss.backward()

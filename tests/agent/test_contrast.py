@@ -45,7 +45,7 @@ def test_a_batch_of_one_meaning_costs_nothing() -> None:
 
 
 def test_rows_of_one_trajectory_or_one_meaning_are_no_negatives() -> None:
-    batch = make_batch(ViewSight(8), size=4, goals=False)
+    batch = make_batch(ViewSight(8), size=4)
     batch = replace(
         batch, meaning=torch.tensor([0, 1, 2, 0]), trajectory=torch.tensor([5, 6, 6, 7])
     )
@@ -85,7 +85,7 @@ def test_candidates_are_one_row_of_each_meaning_of_the_task() -> None:
 
 def test_accuracy_counts_first_and_later_keyframes_apart() -> None:
     batch = replace(
-        make_batch(ViewSight(8), size=3, goals=False),
+        make_batch(ViewSight(8), size=3),
         task=torch.zeros(3, dtype=torch.long),
         meaning=torch.tensor([0, 1, 2]),
         first=torch.tensor([True, False, False]),
@@ -100,7 +100,7 @@ def test_accuracy_counts_first_and_later_keyframes_apart() -> None:
 
 def test_groups_without_a_choice_are_nan() -> None:
     batch = replace(
-        make_batch(ViewSight(8), size=2, goals=False),
+        make_batch(ViewSight(8), size=2),
         task=torch.tensor([0, 1]),
         meaning=torch.tensor([0, 1]),
         first=torch.tensor([True, True]),

@@ -55,7 +55,7 @@ def test_the_papers_order_lets_the_words_into_image_text_features() -> None:
 
 def test_five_queries_stay_apart_after_a_step(network: Sacil) -> None:
     assert network.queries is not None
-    network.loss(make_batch(SIGHT))[0].backward()
+    network.loss(make_batch(SIGHT, goals=SIGHT))[0].backward()
     Lamb(network, weight_decay=0.0).step(0.01)
     queries = network.queries.initial.detach()[0]
     assert len(queries) == 5
@@ -64,7 +64,7 @@ def test_five_queries_stay_apart_after_a_step(network: Sacil) -> None:
 
 
 def test_goals_change_the_goal_contrast_and_nothing_else(network: Sacil) -> None:
-    batch = make_batch(SIGHT)
+    batch = make_batch(SIGHT, goals=SIGHT)
     assert batch.goal is not None
     _, terms = network.loss(batch)
     _, other = network.loss(replace(batch, goal=Views(batch.goal.views.flip(0))))
@@ -74,7 +74,7 @@ def test_goals_change_the_goal_contrast_and_nothing_else(network: Sacil) -> None
 
 
 def test_goal_gradients_reach_the_shared_encoder(network: Sacil) -> None:
-    goal = make_batch(SIGHT).goal
+    goal = make_batch(SIGHT, goals=SIGHT).goal
     assert goal is not None
     network.goal_features(goal).square().sum().backward()
     reached = {name.partition(".")[0] for name in gradients(network)}
@@ -94,8 +94,8 @@ def test_goal_gradients_reach_the_shared_encoder(network: Sacil) -> None:
 )
 def test_variants_have_the_contrasts_they_name(variant: str | None, contrasts: set[str]) -> None:
     network = Sacil(VARIANTS[variant](CONFIG) if variant else CONFIG, TEXT)
-    assert network.needs_goals is ("cgc" in contrasts)
-    _, terms = network.loss(make_batch(SIGHT, goals=network.needs_goals))
+    assert (network.goal_sight is not None) is ("cgc" in contrasts)
+    _, terms = network.loss(make_batch(SIGHT, goals=network.goal_sight))
     assert {name.partition("/")[0] for name in terms} == {"bc"} | contrasts
 
 

@@ -8,11 +8,13 @@ from networks import TEXT, changed, gradients, make_batch, make_inputs, tiny
 
 from baselines.agents import rvt2
 from baselines.agents.rvt2 import DRAWS, Rvt2
-from baselines.scene.sight import ZoomSight
+from baselines.scene.sight import ViewSight, ZoomSight
+from baselines.scene.views import THREE_VIEWS
 from sacil_agent.agents.sacil_rvt2 import CPU, PAPER, SacilRvt2
 
 CONFIG = tiny(CPU)
 SIGHT = ZoomSight(CONFIG.pixels, draws=DRAWS)
+GOALS = ViewSight(CONFIG.pixels, THREE_VIEWS)
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def test_it_acts_like_rvt2_with_the_same_weights(network: SacilRvt2) -> None:
 
 
 def test_the_contrasts_are_added_to_the_loss_of_rvt2(network: SacilRvt2) -> None:
-    batch = make_batch(SIGHT)
+    batch = make_batch(SIGHT, goals=GOALS)
     cloning, _ = Rvt2.loss(network, batch)
     total, terms = network.loss(batch)
     torch.testing.assert_close(total, cloning + terms["itc/loss"] + terms["cgc/loss"])
@@ -46,7 +48,7 @@ def test_the_contrasts_are_added_to_the_loss_of_rvt2(network: SacilRvt2) -> None
 
 @pytest.mark.parametrize("contrast", ["image_text", "current_goal"])
 def test_contrasts_teach_the_coarse_stage_alone(network: SacilRvt2, contrast: str) -> None:
-    batch = make_batch(SIGHT)
+    batch = make_batch(SIGHT, goals=GOALS)
     with torch.no_grad():
         base = network.loss(batch)[0]
     weights = {"image_text_weight": 0.0, "current_goal_weight": 0.0}
@@ -61,7 +63,7 @@ def test_contrasts_teach_the_coarse_stage_alone(network: SacilRvt2, contrast: st
 
 
 def test_image_text_features_have_not_seen_the_words(network: SacilRvt2) -> None:
-    batch = make_batch(SIGHT)
+    batch = make_batch(SIGHT, goals=GOALS)
     other = replace(batch, inputs=changed(batch.inputs, text=batch.inputs.text + 1))
     with torch.no_grad():
         seen, heard = network.coarse_look(batch).read, network.coarse_look(other).read
@@ -70,7 +72,7 @@ def test_image_text_features_have_not_seen_the_words(network: SacilRvt2) -> None
 
 
 def test_goals_change_the_goal_contrast_and_nothing_else(network: SacilRvt2) -> None:
-    batch = make_batch(SIGHT)
+    batch = make_batch(SIGHT, goals=GOALS)
     assert batch.goal is not None
     flipped = replace(batch.goal, views=batch.goal.views.flip(0))
     _, terms = network.loss(batch)

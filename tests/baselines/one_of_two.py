@@ -31,7 +31,7 @@ def network_of(name: str) -> Network:
 
 
 def batch_of(network: Network) -> Batch:
-    return make_batch(network.sight, goals=network.needs_goals)
+    return make_batch(network.sight, goals=network.goal_sight)
 
 
 def draw_alike(patch: Callable[[object, str, object], None]) -> None:

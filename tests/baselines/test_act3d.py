@@ -120,7 +120,7 @@ def test_the_nearest_cells_are_taken_and_unseen_ones_last() -> None:
 
 
 def test_training_draws_new_ghosts_from_the_global_generator(network: Act3d) -> None:
-    batch = make_batch(SIGHT, goals=False)
+    batch = make_batch(SIGHT)
     losses = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
@@ -168,7 +168,7 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
 
 
 def test_signs_and_twins_teach_the_same(network: Act3d) -> None:
-    batch = make_batch(SIGHT, goals=False)
+    batch = make_batch(SIGHT)
     label = batch.labels.quaternion_wxyz
     half_turn = Rotation.from_euler("z", 180, degrees=True)
     turned = Rotation.from_quat(label.numpy(), scalar_first=True) * half_turn

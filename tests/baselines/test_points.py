@@ -10,18 +10,8 @@ from synthetic import observation
 
 from baselines.layers.pointnet import interpolated
 from baselines.scene.augment import Augmentation
-from baselines.scene.points import (
-    HALF_SIDE_M,
-    TABLE_M,
-    CloudSight,
-    PointCloud,
-    Pyramid,
-    average,
-    farthest_first,
-    near_points,
-    nearest_three,
-    visible,
-)
+from baselines.scene.neighbours import Pyramid, farthest_first, near_points, nearest_three
+from baselines.scene.points import HALF_SIDE_M, TABLE_M, CloudSight, PointCloud, average, visible
 from baselines.scene.sight import Moment
 from baselines.scene.views import apply_affine
 from sacil_tasks.errors import UsageError

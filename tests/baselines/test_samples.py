@@ -28,7 +28,7 @@ def keyframes(data):
     return KeyframeSet.load(data / "canon/train/keyframes", TASKS)
 
 
-def loader(keyframes, *, seed=0, goals=False, **recipe):
+def loader(keyframes, *, seed=0, goal_sight=None, **recipe):
     sentences = {tidy(e.instruction) for shard in keyframes.shards for e in shard.episodes}
     rng = np.random.default_rng(0)
     table = {s: rng.normal(size=(len(s.split()), 8)).astype(np.float16) for s in sorted(sentences)}
@@ -38,7 +38,7 @@ def loader(keyframes, *, seed=0, goals=False, **recipe):
         sight=ViewSight(16),
         recipe=Recipe(batch=6, **recipe),
         seed=seed,
-        goals=goals,
+        goal_sight=goal_sight,
     )
 
 
@@ -63,7 +63,7 @@ def test_a_batch_is_a_function_of_seed_and_step(keyframes):
 
 
 def test_goals_do_not_change_what_behaviour_cloning_sees(keyframes):
-    plain, with_goals = loader(keyframes), loader(keyframes, goals=True)
+    plain, with_goals = loader(keyframes), loader(keyframes, goal_sight=ViewSight(16))
     for step in range(5):
         expected = plain.batch(step)
         assert expected.goal is None
@@ -122,7 +122,7 @@ def test_only_observations_with_a_keyframe_are_samples(keyframes):
 
 
 def test_goal_is_the_next_observation(keyframes):
-    batch = loader(keyframes, goals=True, augment=STILL).batch(0)
+    batch = loader(keyframes, goal_sight=ViewSight(16), augment=STILL).batch(0)
     drawn = keyframes.draw(stream(0, 0, "rows"), 6, Recipe().choice_share)
     after = [Sample(s.shard, s.row + 1) for s in drawn]
     moments = [Moment(keyframes.shards[s.shard].observation(s.row)) for s in after]
@@ -130,7 +130,9 @@ def test_goal_is_the_next_observation(keyframes):
 
 
 def test_goals_are_moved_by_their_own_draw(keyframes):
-    fixed, moved = (loader(keyframes, goals=True, **r) for r in ({"augment": STILL}, {}))
+    fixed, moved = (
+        loader(keyframes, goal_sight=ViewSight(16), **r) for r in ({"augment": STILL}, {})
+    )
     assert not torch.equal(fixed.batch(0).goal.views, moved.batch(0).goal.views)
 
 

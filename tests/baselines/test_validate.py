@@ -21,7 +21,7 @@ def loader(data):
     keyframes = KeyframeSet.load(data / "canon/val/keyframes", ["pick_and_lift"])
     sentences = {tidy(e.instruction) for e in keyframes.shards[0].episodes}
     text = SentenceTable(TextSpec("fake", 4, 32, "0"), dict.fromkeys(sentences, np.ones((2, 4))))
-    return Loader(keyframes, text, sight=ViewSight(16), recipe=Recipe(), seed=0, goals=False)
+    return Loader(keyframes, text, sight=ViewSight(16), recipe=Recipe(), seed=0)
 
 
 class Cheat(Network):
