@@ -9,6 +9,7 @@ import logging
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import TypeAlias
 
 import torch
@@ -18,6 +19,7 @@ from torch.nn.parallel import DistributedDataParallel
 from baselines.agent import Network, Recipe
 from baselines.batch import Batch, moved
 from baselines.distributed import anywhere, batch_norms, rank, ranks
+from baselines.layers.products import FullWidth
 from baselines.loader import Loader
 from baselines.optim import Ema, Lamb, TensorTable, copy_into, learning_rate
 from baselines.samples import stream
@@ -129,14 +131,18 @@ class Trainer:
         """
         # Dropout draws from torch's global generator: fix it by step, or a resumed run differs.
         torch.manual_seed(int(stream(self._seed, self.step, "torch").integers(2**63)) + rank())
-        # D-precision: bfloat16 in the `cpu` preset.
-        rough = self.recipe.precision == "bf16"
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=rough):
+        with self._arithmetic():
             loss, terms = self._loss(batch)
         if anywhere(not torch.isfinite(loss)):
             raise self._diverged("the loss")
         loss.backward()
         return {name: float(term) for name, term in ({"loss": loss.detach()} | terms).items()}
+
+    def _arithmetic(self) -> AbstractContextManager[object]:
+        """D-precision: bfloat16 in the `cpu` preset."""
+        if self.recipe.precision == "bf16":
+            return torch.autocast(self.device.type, torch.bfloat16)
+        return FullWidth()
 
     def check_finite(self) -> None:
         """Refuse to save weights that a last, too large step has spoilt.

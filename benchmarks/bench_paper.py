@@ -3,12 +3,13 @@
     python benchmarks/bench_paper.py [--agents rvt rvt2 ...] [--rounds 3] [--threads 2]
 
 Forward and backward of the `paper` presets in fp32, with their dropout and 77 text tokens of 512
-numbers. The plain version has the same weights and writes every step out: scores of attention
-with their mask as whole matrices, queries, keys and values one after the other, the padding of
-short sentences, convolutions of up-sampled and of joined maps, products after gathering, channels
-before pixels in memory. Rounds of both take turns, so that a busy machine disturbs both alike;
-the ratio is one of processor time. What differs between them is said beside it, or the comparison
-would be void. Last, the heatmap decoder against scoring every cell of the grid.
+numbers. The plain version has the same weights and writes every step out: products as PyTorch
+takes them, scores of attention with their mask as whole matrices, queries, keys and values one
+after the other, the padding of short sentences, convolutions of up-sampled and of joined maps,
+products after gathering, channels before pixels in memory. Rounds of both take turns, so that a
+busy machine disturbs both alike; the ratio is one of processor time. What differs between them is
+said beside it, or the comparison would be void. Last, the heatmap decoder against scoring every
+cell of the grid.
 """
 
 import resource
@@ -35,6 +36,7 @@ from baselines.agent import Network, agent_modules, find_agent
 from baselines.agents import act3d, hiveformer, polarnet, rvt, rvt2
 from baselines.batch import Batch, Inputs, Labels
 from baselines.layers import attention, pointnet, rotary, stems, unet
+from baselines.layers.products import FullWidth
 from baselines.layers.stems import leaky
 from baselines.loader import inputs_of
 from baselines.rotation import canonical_yaw, quaternion_to_bins
@@ -287,7 +289,8 @@ def difference(network: Network, batch: Batch) -> tuple[float, float]:
     """Between both versions without dropout: the largest of a loss term, and of a gradient as a
     share of the largest number in its tensor."""
     network.eval()
-    ours, gradients = learn(network, batch), gradients_of(network)
+    with FullWidth():
+        ours, gradients = learn(network, batch), gradients_of(network)
     with plain():
         theirs = learn(network, batch)
     network.train()
@@ -321,7 +324,7 @@ def time_agent(name: str, config: BenchConfig) -> str:
     for _ in range(config.rounds):
         for version in range(2):
             starts = time.perf_counter(), time.process_time()
-            with plain() if version else ExitStack():
+            with plain() if version else FullWidth():
                 learn(network, batch)
             wall[version].append(time.perf_counter() - starts[0])
             core[version].append(time.process_time() - starts[1])

@@ -19,12 +19,11 @@ def bias() -> torch.Tensor:
     return padding_bias(torch.arange(9) < torch.tensor([[9], [5]]))
 
 
-def whole(
-    q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, generator: torch.Generator
-) -> torch.Tensor:
+def whole(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
     """The same with every score in memory."""
     weights = (q @ k.mT / q.shape[-1] ** 0.5 + bias().double()).softmax(-1)
-    return weights * tiles.kept(weights, DROPOUT, generator) / (1 - DROPOUT) @ v
+    stays = tiles.lose(torch.ones_like(weights), DROPOUT, seed)
+    return weights * stays / (1 - DROPOUT) @ v
 
 
 def test_values_and_gradients_are_those_of_whole_matrices() -> None:
@@ -32,8 +31,7 @@ def test_values_and_gradients_are_those_of_whole_matrices() -> None:
     torch.manual_seed(1)
     found = tiles.attend_with_loss(*inputs, bias=bias(), dropout=DROPOUT)
     torch.manual_seed(1)
-    generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())))
-    expected = whole(*inputs, generator)
+    expected = whole(*inputs, int(torch.randint(2**62, ())))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     direction = torch.randn_like(found)
     pairs = [torch.autograd.grad(out, inputs, direction) for out in (found, expected)]
@@ -54,10 +52,22 @@ def test_gradients_are_right_for_any_tile(tile: int, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("dropout", [0.1, 0.5])
 def test_as_many_are_lost_as_asked_for(dropout: float) -> None:
-    gone = 1 - tiles.kept(torch.empty(1000, 997), dropout, torch.Generator().manual_seed(0))
-    rows = gone.mean(1)
-    assert gone.mean() == pytest.approx(dropout, abs=2e-3)
-    assert rows.std() == pytest.approx((dropout * (1 - dropout) / 997) ** 0.5, rel=0.1)
+    gone = 1 - tiles.lose(torch.ones(1000, 997), dropout, seed=2**61 + 1)
+    for means in (gone.mean(0), gone.mean(1)):
+        assert means.mean() == pytest.approx(dropout, abs=2e-3)
+        assert means.std() == pytest.approx((dropout * (1 - dropout) / 997) ** 0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 5, 2**40])
+@pytest.mark.parametrize("change", [1, 2**32, 2**61])
+def test_what_is_lost_does_not_follow_from_neighbours_or_from_another_seed(
+    seed: int, change: int
+) -> None:
+    first, other = (tiles.lose(torch.ones(200_000), 0.1, s) for s in (seed, seed + change))
+    shifted = [first.roll(by) for by in (1, 2, 16, 777)]
+    for others in (other, *shifted):
+        correlation = torch.corrcoef(torch.stack([first, others]))[0, 1]
+        assert abs(correlation) < 0.01
 
 
 def test_without_loss_it_is_attention() -> None:
