@@ -162,6 +162,9 @@ class Plan:
     keyframes: Mapping[str, str]
     """Task -> content hash of its keyframes."""
 
+    text: TextSpec
+    """By which words are read."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
@@ -200,8 +203,10 @@ class TrainState:
             metadata = file.metadata() or {}
             progress = parsed(Progress, metadata["progress"])
             plan = parsed(Plan, metadata["plan"])
-            if not 0 <= progress.step <= plan.steps:
+            if not 0 <= progress.step <= plan.steps >= 1:
                 raise ValueError(f"step {progress.step} of {plan.steps}")
+            if not (progress.wall_s >= 0 and progress.cpu_s >= 0):  # NaN is neither
+                raise ValueError(f"{progress.wall_s} s on {progress.cpu_s} s of a core")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return cls(tensors=tensors, progress=progress, plan=plan)
 

@@ -95,12 +95,14 @@ class Ema:
 
 
 def copy_into(target: Mapping[str, Tensor], source: Mapping[str, Tensor]) -> None:
-    """Overwrite the values of `target` with those of `source`; names must agree.
+    """Overwrite the values of `target` with those of `source`.
 
     Raises:
-        KeyError: a tensor of `target` is not in `source`.
-        RuntimeError: a shape differs.
+        ValueError: names, shapes or types differ; nothing was overwritten.
     """
+    kinds = [{n: (t.shape, t.dtype) for n, t in tensors.items()} for tensors in (target, source)]
+    if different := sorted(n for n, _ in kinds[0].items() ^ kinds[1].items()):
+        raise ValueError(f"other tensors: {', '.join(different)}")
     with torch.no_grad():
         for name, tensor in target.items():
             tensor.copy_(source[name])

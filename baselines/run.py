@@ -123,7 +123,7 @@ class Run:
         """
         try:
             self.trainer.restore(state.tensors, state.progress.step)
-        except (KeyError, RuntimeError) as error:
+        except ValueError as error:
             raise UsageError(
                 f"{self.folder} holds the state of another network. Choose another --out."
             ) from error

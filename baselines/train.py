@@ -18,11 +18,9 @@ from typing import Any
 import torch
 
 from baselines.checkpoint import (
-    CONFIG,
     METRICS,
     STATE,
     TEXT,
-    Identity,
     Plan,
     TrainState,
     trained_samples,
@@ -105,8 +103,12 @@ def _is_complete(job: Job, state: TrainState | None) -> bool:
 
 def _begin(material: Material) -> Run:
     """Fix the number of steps and begin, over whatever a run that never got this far has left."""
-    data = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
-    plan = Plan(steps=_steps(material), request=_request(material.job), keyframes=data)
+    plan = Plan(
+        steps=_steps(material),
+        request=_request(material.job),
+        keyframes=_hashes(material),
+        text=material.text.spec,
+    )
     if rank() == 0:
         (material.job.options.folder / METRICS).unlink(missing_ok=True)
     material = _planned(material, plan)
@@ -143,23 +145,27 @@ def _write_down(material: Material) -> None:
 def _continue(material: Material, state: TrainState) -> Run:
     """Take up a run where it was saved; files that were lost meanwhile are written again."""
     material = _planned(material, state.plan)
-    folder, encoder = material.job.options.folder, material.text.spec
-    if (folder / CONFIG).is_file() and (before := Identity.load(folder).text) != encoder:
+    folder, before, encoder = material.job.options.folder, state.plan.text, material.text.spec
+    if before != encoder:
         raise UsageError(
             f"{folder} holds a run that reads words by {before.short}, but what this machine has "
             f"under that name is {encoder.short}. Bring back its files, or choose another --out."
         )
-    found = {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
-    for task, sha256 in state.plan.keyframes.items():
-        if found.get(task) != sha256:
-            raise UsageError(
-                f"the keyframes of {task} in {material.job.options.data} are not those the run "
-                "began with. Give their folder with --data, or choose another --out."
-            )
+    different = _hashes(material).items() ^ state.plan.keyframes.items()
+    if changed := sorted(task for task, _ in different):
+        raise UsageError(
+            f"the keyframes of {changed[0]} in {material.job.options.data} are not those the run "
+            "began with. Give their folder with --data, or choose another --out."
+        )
     run = _run(material, state.plan)
     run.resume(state)
     _write_down(material)
     return run
+
+
+def _hashes(material: Material) -> dict[str, str]:
+    """Task -> content hash of its keyframes."""
+    return {shard.task: shard.content_sha256 for shard in material.keyframes.shards}
 
 
 def _check_resumable(job: Job, state: TrainState) -> None:

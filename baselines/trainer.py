@@ -9,7 +9,7 @@ import logging
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import TypeAlias
 
 import torch
@@ -142,7 +142,7 @@ class Trainer:
         """D-precision: bfloat16 in the `cpu` preset."""
         if self.recipe.precision == "bf16":
             return torch.autocast(self.device.type, torch.bfloat16)
-        return FullWidth()
+        return FullWidth() if self.device.type == "cpu" else nullcontext()
 
     def check_finite(self) -> None:
         """Refuse to save weights that a last, too large step has spoilt.
@@ -176,7 +176,7 @@ class Trainer:
         """Continue from what `state` gave at `step`.
 
         Raises:
-            KeyError, RuntimeError: the tensors are those of another network.
+            ValueError: the tensors are those of another network.
         """
         copy_into(self.state(), tensors)
         self.step = step

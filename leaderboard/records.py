@@ -11,7 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeAlias
+
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from sacil_tasks.errors import UsageError
 from sacil_tasks.files import unwritable, whole_lines
@@ -20,6 +22,9 @@ from sacil_tasks.typed import parsed
 
 SCHEMA_VERSION = 1
 EPISODES_FILE = "episodes.jsonl"
+
+Labels: TypeAlias = tuple[str, ...]
+"""Labels of sizes, in some order."""
 
 ERROR = "ERROR"
 """Outcome of an episode that broke off; the other outcomes are those of `sacil_tasks.outcomes`."""
@@ -48,14 +53,14 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where the time of an episode went; never part of a comparison of results."""
 
-    total: float = 0.0
-    setup: float = 0.0
+    total: NonNegativeFloat = 0.0
+    setup: NonNegativeFloat = 0.0
     """Building the scene."""
-    planning: float = 0.0
+    planning: NonNegativeFloat = 0.0
     """Of the policy's keyframes and, for a scene's first words, of the expert's under all words."""
-    physics: float = 0.0
-    rendering: float = 0.0
-    inference: float = 0.0
+    physics: NonNegativeFloat = 0.0
+    rendering: NonNegativeFloat = 0.0
+    inference: NonNegativeFloat = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +70,10 @@ class EpisodeRecord:
     task: str
     split: str
     partition: str
-    scene_set: int
-    scene: int
+    scene_set: NonNegativeInt
+    scene: NonNegativeInt
     """Index of the scene within its task, partition and scene set."""
-    variation: int
+    variation: NonNegativeInt
     """Index of the words within the scene."""
 
     agent: str
@@ -82,7 +87,7 @@ class EpisodeRecord:
     instruction: str = ""
     slots: Mapping[str, str]
     """The words filled into the instruction."""
-    sizes_m: tuple[float, ...] = ()
+    sizes_m: tuple[PositiveFloat, ...] = ()
     """Sizes of candidates 0, 1, 2."""
     fingerprint: str = ""
     """Hash of geometry, poses and words: equal on every machine."""
@@ -96,9 +101,9 @@ class EpisodeRecord:
     """Strict: the named candidates only."""
     success_lenient: bool = False
     """The task's own predicate."""
-    asked: tuple[str, ...] = ()
+    asked: Labels = ()
     """Size labels named, in order."""
-    handled: tuple[str, ...] = ()
+    handled: Labels = ()
     """Size labels of the candidates acquired or pressed, in order; empty if none was."""
     aimed: str | None = None
     """Label of the candidate (or `clutter`) under the first keyframe that closes the gripper near
@@ -107,7 +112,7 @@ class EpisodeRecord:
     """`success`, `limit`, `invalid_action` or `error`."""
     reason: str = ""
     """Why an action was refused, or the error's text."""
-    keyframes: int = 0
+    keyframes: NonNegativeInt = 0
     """Keyframes executed."""
 
     seconds: Seconds = Seconds()
@@ -144,13 +149,14 @@ class EpisodeRecord:
         if not record.consistent:
             raise ValueError(
                 f"outcome {record.outcome}, end {record.end}, success {record.success} (lenient "
-                f"{record.success_lenient}) contradict each other"
+                f"{record.success_lenient}), asked {record.asked} and handled {record.handled} "
+                "contradict each other"
             )
         return record
 
     @property
     def consistent(self) -> bool:
-        """Whether verdict, outcome code and end can stand beside each other."""
+        """Whether verdict, outcome code, end and what was handled can stand beside each other."""
         return (
             self.outcome in (*OUTCOMES, ERROR)
             and self.success == (self.outcome == OUTCOMES[0])
@@ -158,7 +164,20 @@ class EpisodeRecord:
             and self.errored == (self.outcome == ERROR)
             and self.success_lenient >= self.success
             and self.end in ENDS
+            and self._handled_fits
         )
+
+    @property
+    def _handled_fits(self) -> bool:
+        """Whether what was handled allows the outcome code."""
+        match self.outcome:
+            case "SUCCESS":
+                return set(self.handled) <= set(self.asked)
+            case "ORDER_ERROR":
+                return self.handled != self.asked[: len(self.handled)]
+            case "NO_INTERACTION":
+                return not self.handled
+        return True
 
 
 class EpisodeLog:

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -21,7 +22,7 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
-from baselines.configs import Fraction, Positive, check_numbers
+from baselines.configs import Fraction, Positive, Range, check_numbers
 from baselines.layers.attention import LEAK, padding_bias
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
@@ -46,7 +47,7 @@ HEAT_REACH_M = 0.01
 class PolarNetConfig:
     """Sizes of PolarNet; the defaults are the `cpu` preset (D-polarnet-cpu)."""
 
-    voxel_m: Positive = 0.005
+    voxel_m: Annotated[float, Range(1e-4)] = 0.005
     """Edge of the cells in which points are averaged (D-polarnet-voxel)."""
 
     points: int = 2048

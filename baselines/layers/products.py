@@ -12,15 +12,26 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
+WORTHWHILE = 2**20
+"""Multiplications from which a product is faster here: oneDNN takes some 10 us to set one up."""
+
 
 def _onednn() -> Callable[..., Tensor] | None:
-    """What PyTorch's compiler calls for a linear layer; None where this build has none of it."""
-    if not torch.backends.mkldnn.is_available():
+    """What PyTorch's compiler calls for a linear layer.
+
+    None where this build has none, or one with other arguments: it is not part of PyTorch's API.
+    """
+    one = torch.ones(1, 1)
+    try:
+        linear = getattr(torch.ops.mkldnn, "_linear_pointwise")  # noqa: B009 (private: SLF001)
+        linear(one, one, None, "none", [], "")
+    except (AttributeError, RuntimeError, TypeError):
         return None
-    return getattr(torch.ops.mkldnn, "_linear_pointwise", None)
+    return linear
 
 
 ONEDNN = _onednn()
@@ -31,16 +42,24 @@ def product(
     weight: Float[Tensor, "n k"],
     bias: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "*rows n"]:
-    """`x @ weight.T + bias`, outside of autograd; either factor may be a transposed view."""
-    if ONEDNN is None or not _fits(x, weight):
+    """`x @ weight.T + bias`, outside of autograd; all of them may be views."""
+    if ONEDNN is None or not _fits(x, weight, bias):
         return functional.linear(x, weight, bias)
+    bias = bias if bias is None else bias.contiguous()
     return ONEDNN(_packed(x), _packed(weight), bias, "none", [], "")
 
 
-def _fits(x: Tensor, weight: Tensor) -> bool:
-    """Matrices of 32-bit numbers on a CPU, with something in them."""
-    kinds = {(factor.dtype, factor.device.type) for factor in (x, weight)}
-    return kinds == {(torch.float32, "cpu")} and x.ndim > 1 and x.numel() > 0
+def _fits(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
+    """Matrices, large enough, of 32-bit numbers on a CPU; what is wrong is left to PyTorch."""
+    factors = (x, weight) if bias is None else (x, weight, bias)
+    return (
+        {(factor.dtype, factor.device.type) for factor in factors} == {(torch.float32, "cpu")}
+        and x.ndim > 1
+        and weight.ndim == 2
+        and x.shape[-1] == weight.shape[1]
+        and (bias is None or bias.shape == weight.shape[:1])
+        and x.numel() * len(weight) >= WORTHWHILE
+    )
 
 
 def _packed(x: Tensor) -> Tensor:
@@ -64,6 +83,7 @@ class _Linear(torch.autograd.Function):
         return product(x, weight, bias)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         x, weight = ctx.saved_tensors
         gradient = gradients[0]
@@ -77,7 +97,7 @@ class _Linear(torch.autograd.Function):
 
 
 class FullWidth(TorchFunctionMode):
-    """Inside, every linear layer that learns in 32 bits on a CPU takes `product`."""
+    """Inside, linear layers of 32-bit numbers on a CPU take `product` while gradients are kept."""
 
     def __torch_function__(
         self,
@@ -87,15 +107,13 @@ class FullWidth(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         """Called by torch in place of each of its functions."""
-        if func is functional.linear and _learns(*args, **(kwargs or {})):
+        if func is functional.linear:
             return _linear(*args, **(kwargs or {}))
         return func(*args, **(kwargs or {}))
 
 
-def _learns(input: Tensor, weight: Tensor, bias: Tensor | None = None) -> bool:
-    rough = torch.is_autocast_enabled(input.device.type)
-    return torch.is_grad_enabled() and not rough and _fits(input, weight)
-
-
 def _linear(input: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    rough = torch.is_autocast_enabled(input.device.type)
+    if rough or not torch.is_grad_enabled() or not _fits(input, weight, bias):
+        return functional.linear(input, weight, bias)
     return _Linear.apply(input, weight, bias)

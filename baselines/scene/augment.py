@@ -51,7 +51,9 @@ class Augmentation:
         """Affine map base to base."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         turn = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
-        return np.column_stack([turn, self.shift_m])
+        matrix = np.column_stack([turn, self.shift_m])
+        matrix.flags.writeable = False  # every caller gets the same array
+        return matrix
 
     def move_points(self, points_in_base: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
         """Move positions (m)."""

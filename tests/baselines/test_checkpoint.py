@@ -52,7 +52,7 @@ def folder(tmp_path, identity):
     known = {"lift it": np.ones((3, 8), np.float16)}
     SentenceTable(TEXT_SPEC, known).save(path / TEXT, known)
     (path / PROVENANCE).write_text('{"complete": true}')
-    plan = Plan(steps=5, request={}, keyframes={})
+    plan = Plan(steps=5, request={}, keyframes={}, text=TEXT_SPEC)
     TrainState(tensors={}, progress=Progress(step=5, wall_s=0, cpu_s=0), plan=plan).save(path)
     return path
 
@@ -151,7 +151,7 @@ def test_a_config_of_other_sizes_does_not_fit_the_weights(folder, identity):
 def test_a_state_comes_back_bit_for_bit(tmp_path):
     tensors = {"weights/a": torch.randn(3), "average/n": torch.tensor(7)}
     progress = Progress(step=9, wall_s=1.5, cpu_s=1.0)
-    plan = Plan(steps=10, request={"seed": 0}, keyframes={"pick_and_lift": "a1"})
+    plan = Plan(steps=10, request={"seed": 0}, keyframes={"pick_and_lift": "a1"}, text=TEXT_SPEC)
     TrainState(tensors=tensors, progress=progress, plan=plan).save(tmp_path)
     loaded = TrainState.load(tmp_path)
     assert (loaded.progress, loaded.plan) == (progress, plan)
@@ -163,12 +163,16 @@ def test_no_state_is_none_and_a_damaged_one_is_named(tmp_path):
     (tmp_path / STATE).write_bytes(b"1234")
     with pytest.raises(UsageError, match=r"train_state\.safetensors is truncated"):
         TrainState.load(tmp_path)
-    plan = '{"steps": 10, "request": {}, "keyframes": {}}'
+    known = {"request": {}, "keyframes": {}, "text": asdict(TEXT_SPEC)}
+    plan, none = (json.dumps({"steps": steps} | known) for steps in (10, 0))
     for metadata in (
         None,
         {"progress": "5", "plan": plan},
         {"progress": '{"step": "5", "wall_s": 1, "cpu_s": 1}', "plan": plan},
         {"progress": '{"step": 11, "wall_s": 1, "cpu_s": 1}', "plan": plan},
+        {"progress": '{"step": 5, "wall_s": -1, "cpu_s": 1}', "plan": plan},
+        {"progress": '{"step": 5, "wall_s": 1, "cpu_s": NaN}', "plan": plan},
+        {"progress": '{"step": 0, "wall_s": 1, "cpu_s": 1}', "plan": none},
         {"progress": '{"step": 5, "wall_s": 1, "cpu_s": 1}', "plan": "{}"},
     ):
         (tmp_path / STATE).write_bytes(save({"a": torch.ones(1)}, metadata))

@@ -1,8 +1,11 @@
 """Products at full width against 64-bit ones, and who takes them."""
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from baselines.layers import products
 from baselines.layers.products import FullWidth, over_rows, product
@@ -22,9 +25,17 @@ FACTORS = {
     "none": lambda: drawn(0, 5),
 }
 
+BIASES = {
+    "none": lambda: None,
+    "whole": lambda: drawn(4, seed=2),
+    "every other": lambda: drawn(8, seed=2)[::2],
+    "expanded": lambda: drawn(1, seed=2).expand(4),
+}
+
 
 @pytest.fixture(params=["onednn", "torch"], autouse=True)
 def library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(products, "WORTHWHILE", 1)  # however small
     if request.param == "torch":
         monkeypatch.setattr(products, "ONEDNN", None)
     elif products.ONEDNN is None:
@@ -32,12 +43,13 @@ def library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("bias", [None, drawn(4, seed=2)], ids=["", "biased"])
+@pytest.mark.parametrize("addend", BIASES)
 @pytest.mark.parametrize("name", FACTORS)
 def test_product_is_the_exact_one_whatever_lies_where(
-    name: str, bias: Tensor | None, dtype: torch.dtype
+    name: str, addend: str, dtype: torch.dtype
 ) -> None:
-    x, bias = FACTORS[name]().to(dtype), bias if bias is None else bias.to(dtype)
+    x, bias = FACTORS[name]().to(dtype), BIASES[addend]()
+    bias = bias if bias is None else bias.to(dtype)
     for weight in (drawn(4, 5, seed=1).to(dtype), drawn(5, 4, seed=1).to(dtype).mT):
         exact = x.double() @ weight.double().mT + (0 if bias is None else bias.double())
         torch.testing.assert_close(product(x, weight, bias).double(), exact, rtol=0, atol=1e-5)
@@ -63,11 +75,46 @@ def test_layers_learn_the_same(name: str, kind: str) -> None:
     layer = LAYERS[kind]()
     x = FACTORS[name]().requires_grad_()
     wanted = [x, *(p for p in layer.parameters() if p.requires_grad)]
-    exact = torch.autograd.grad(layer(x).square().sum(), wanted)
     with FullWidth():
         found = torch.autograd.grad(layer(x).square().sum(), wanted)
+    exact_layer, exact_x = copy.deepcopy(layer).double(), x.detach().double().requires_grad_()
+    exact = [exact_x, *(p for p in exact_layer.parameters() if p.requires_grad)]
+    exact = torch.autograd.grad(exact_layer(exact_x).square().sum(), exact)
     for ours, theirs in zip(found, exact, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("x", "weight", "bias"),
+    [
+        (drawn(5), drawn(4, 5), None),
+        (drawn(7, 5), drawn(5), None),
+        (drawn(7, 5), drawn(4, 5), drawn(1)),
+        (drawn(7, 5), drawn(4, 5), drawn(7, 4)),
+        (drawn(7, 0), drawn(4, 0), drawn(4)),
+        (drawn(7, 5), drawn(0, 5), None),
+    ],
+)
+def test_unusual_shapes_are_left_to_torch(x: Tensor, weight: Tensor, bias: Tensor | None) -> None:
+    expected = functional.linear(x, weight.requires_grad_(), bias)
+    with FullWidth():
+        assert torch.equal(functional.linear(x, weight, bias), expected)
+    with FullWidth(), pytest.raises(RuntimeError, match="shape"):
+        functional.linear(drawn(7, 5), drawn(4, 6).requires_grad_())
+
+
+def test_gradients_of_gradients_are_refused() -> None:
+    layer, x = nn.Linear(5, 4), drawn(7, 5).requires_grad_()
+    with FullWidth():
+        (gradient,) = torch.autograd.grad(layer(x).tanh().sum(), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
+def test_small_products_are_left_to_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(products, "WORTHWHILE", 7 * 5 * 4 + 1)
+    monkeypatch.setattr(products, "ONEDNN", None if products.ONEDNN is None else pytest.fail)
+    product(drawn(7, 5), drawn(4, 5))
 
 
 def test_only_layers_that_learn_in_32_bits_take_them(monkeypatch: pytest.MonkeyPatch) -> None:

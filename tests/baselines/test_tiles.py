@@ -26,7 +26,11 @@ def whole(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, seed: int) -> torch
     return weights * stays / (1 - DROPOUT) @ v
 
 
-def test_values_and_gradients_are_those_of_whole_matrices() -> None:
+@pytest.mark.parametrize("many", [1, 130, tiles.MANY])
+def test_values_and_gradients_are_those_of_whole_matrices(
+    many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tiles, "MANY", many)
     inputs = made()
     torch.manual_seed(1)
     found = tiles.attend_with_loss(*inputs, bias=bias(), dropout=DROPOUT)
@@ -39,15 +43,22 @@ def test_values_and_gradients_are_those_of_whole_matrices() -> None:
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("tile", [1, 9, 20, 63, 130])
-def test_gradients_are_right_for_any_tile(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("tile", "many"), [(1, 1), (9, 1), (20, 1), (63, 1), (130, 130)])
+def test_gradients_are_right_for_any_tile(
+    tile: int, many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tiles, "TILE", tile)
+    monkeypatch.setattr(tiles, "MANY", many)
 
     def attend(*inputs: torch.Tensor) -> torch.Tensor:
         torch.manual_seed(2)
         return tiles.attend_with_loss(*inputs, bias=bias(), dropout=DROPOUT)
 
     assert torch.autograd.gradcheck(attend, made(), fast_mode=True)
+
+
+def test_nearly_all_can_be_lost() -> None:
+    assert tiles.lose(torch.ones(1000), 1 - 2**-40, seed=0).sum() == 0
 
 
 @pytest.mark.parametrize("dropout", [0.1, 0.5])

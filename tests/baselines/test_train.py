@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,13 +185,36 @@ def test_a_run_is_not_resumed_with_another_text_encoder(data, tmp_path, monkeypa
         stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             train(*flags)
-    config = tmp_path / "run" / CONFIG
-    content = json.loads(config.read_text())
-    content["text"]["fingerprint"] = "0" * 64
-    config.write_text(json.dumps(content))
+    state = TrainState.load(tmp_path / "run")
+    text = replace(state.plan.text, fingerprint="0" * 64)
+    replace(state, plan=replace(state.plan, text=text)).save(tmp_path / "run")
+    (tmp_path / "run" / CONFIG).unlink()
     with pytest.raises(UsageError, match=r"words by minilm \(0000.*but what this machine has"):
         train(*flags, "--resume")
-    assert json.loads(config.read_text()) == content
+    assert not (tmp_path / "run" / CONFIG).exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors: tensors | {"weights/position.weight": torch.ones(1)},
+        lambda tensors: {name: tensor.long() for name, tensor in tensors.items()},
+        lambda tensors: tensors | {"weights/other": torch.ones(1)},
+        lambda tensors: {name: tensors[name] for name in sorted(tensors)[1:]},
+    ],
+)
+def test_a_run_is_not_resumed_with_the_state_of_another_network(
+    data, tmp_path, monkeypatch, change
+):
+    flags = (data, tmp_path / "run", "--steps", "12")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(*flags)
+    state = TrainState.load(tmp_path / "run")
+    replace(state, tensors=change(state.tensors)).save(tmp_path / "run")
+    with pytest.raises(UsageError, match="the state of another network"):
+        train(*flags, "--resume")
 
 
 @pytest.mark.parametrize("samples", ['"many"', "1e999", "[1]"])

@@ -57,6 +57,11 @@ def test_a_foreign_line_is_refused_and_left_alone(run_folder, junk):
         {"seconds": {"total": "long"}},
         {"seconds": {"napping": 1.0}},
         {"sizes_m": None},
+        {"sizes_m": [0.03, -0.04, 0.05]},
+        {"keyframes": -3},
+        {"scene": -1},
+        {"seconds": {"total": -1.0}},
+        {"seconds": {"planning": float("nan")}},
     ],
     ids=str,
 )
@@ -70,6 +75,9 @@ def test_a_value_of_another_type_is_refused(run_folder, changes):
         read_records(log)
 
 
+WON = {"outcome": "SUCCESS", "success": True, "success_lenient": True, "end": "success"}
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -80,6 +88,9 @@ def test_a_value_of_another_type_is_refused(run_folder, changes):
         {"success_lenient": True, "end": "limit"},
         {"outcome": "ERROR", "end": "limit"},
         {"outcome": "TRIUMPH"},
+        {"outcome": "NO_INTERACTION", "asked": ["small"], "handled": ["small"]},
+        {"outcome": "ORDER_ERROR", "asked": ["small", "large"], "handled": ["small"]},
+        WON | {"asked": ["small"], "handled": ["large"]},
     ],
     ids=str,
 )
