@@ -1,4 +1,4 @@
-"""Labels and loss for heat over the points of a scene (D-polarnet-heat).
+"""Labels and loss for heat over the points of a scene (D-polarnet-heat, D-hiveformer-heat).
 
 n counts samples; p the points, or the pixels of all cameras, that share a sample's heat.
 """
