@@ -9,7 +9,8 @@ The preset `paper` has the published sizes (section 3 of that paper); `cpu` keep
 size one core can train. The published network reads a whole episode at once; its single layer
 takes keys and values from the tokens as they were embedded, so only the present step needs
 queries and a decoder here, and earlier steps cost no more than their tokens (D-hiveformer-steps).
-Images stay as they are when the recipe moves points, gripper and label (D-hiveformer-augment).
+Images are cropped, but do not follow when the recipe moves points, gripper and label
+(D-hiveformer-augment).
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,10 +24,11 @@ from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
-from baselines.configs import Fraction, Odd, check_numbers
+from baselines.configs import Fraction, Natural, Odd, check_numbers
 from baselines.layers.attention import attend, padding_bias
+from baselines.layers.heat import divergence, falling_off
 from baselines.layers.multiview import trimmed_text
-from baselines.layers.pictures import heat_over, mean_point, network_images, pooled_points
+from baselines.layers.pictures import log_heat_over, mean_point, network_images, pooled_points
 from baselines.layers.regression import POSE, UNTURNED, Regressed
 from baselines.layers.stems import leaky
 from baselines.layers.unet import UnetDecoder, UnetEncoder, replicated
@@ -38,6 +40,9 @@ from sacil_tasks.interface import CAMERAS, IMAGE_PIXELS, MAX_KEYFRAMES, SCENE_BO
 
 TEMPERATURE = 0.1
 """Of the softmax over pixels."""
+
+UNSEEN_M = 1e3
+"""How far from any label a pixel counts that shows no point."""
 
 MAX_WORDS = 77
 """Places in a sentence that have an embedding (the published code's 42 are too few for its own
@@ -84,8 +89,14 @@ class HiveFormerConfig:
     dropout: Fraction = 0.0
     """Dropout on attention probabilities and on what each part adds to a token."""
 
+    heat_weight: float = 1.0
+    """Weight of the heatmap's divergence from its label (D-hiveformer-heat)."""
+
     position_weight: float = 100.0
     """Weight of the squared position error in square metres (D-hiveformer-recipe)."""
+
+    crop_px: Natural = 16
+    """How far the frame of the images moves in training, at most (D-hiveformer-augment)."""
 
     recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", augment=UNTURNED))
     """How to train."""
@@ -121,7 +132,9 @@ PAPER = HiveFormerConfig(
     heads=8,
     hidden=64,
     dropout=0.1,
+    heat_weight=0.0,
     position_weight=1.0,
+    crop_px=0,
     recipe=Recipe(
         samples=100_000 * 32,
         batch=32,
@@ -140,8 +153,8 @@ PAPER = HiveFormerConfig(
 class Choice:
     """What the network says about the next keyframe."""
 
-    heat: Float[Tensor, "b k h w"]
-    """Probability of each pixel; sums to 1 over all cameras."""
+    log_heat: Float[Tensor, "b k h w"]
+    """Logarithm of each pixel's probability; these sum to 1 over all cameras."""
 
     action: Regressed
 
@@ -153,7 +166,7 @@ class HiveFormer(Network):
         """Fresh weights; `text` says how wide a token vector is."""
         super().__init__()
         self.config = config
-        self.sight = CameraSight(remembers=True, steps=config.window)
+        self.sight = CameraSight(remembers=True, steps=config.window, crop_px=config.crop_px)
         self.encoder = UnetEncoder(config.stem, config.channels)
         self.tokens = VisualTokens(config)
         self.words = WordTokens(text.dim, config.width)
@@ -217,13 +230,14 @@ class HiveFormer(Network):
     def _choose(
         self, scene: Pictures, logits: Float[Tensor, "m h w"], pose: Float[Tensor, "b 14"]
     ) -> Choice:
-        heat = heat_over(logits.unflatten(0, (-1, len(CAMERAS))), scene.seen[:, -1], TEMPERATURE)
-        position = mean_point(heat, scene.xyz_in_cube[:, -1]) + pose[:, :OFFSET]
-        return Choice(heat, Regressed(position, pose[:, OFFSET:]))
+        cameras = logits.unflatten(0, (-1, len(CAMERAS)))
+        log_heat = log_heat_over(cameras, scene.seen[:, -1], TEMPERATURE)
+        position = mean_point(log_heat.exp(), scene.xyz_in_cube[:, -1]) + pose[:, :OFFSET]
+        return Choice(log_heat, Regressed(position, pose[:, OFFSET:]))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning."""
-        return cloning_loss(self(batch.inputs), batch.labels, self.config)
+        return cloning_loss(self(batch.inputs), batch, self.config)
 
     def act(self, inputs: Inputs) -> Prediction:
         """The keyframe that was regressed."""
@@ -361,17 +375,30 @@ class PoseHead(nn.Module):
 
 
 def cloning_loss(
-    choice: Choice, labels: Labels, config: HiveFormerConfig
+    choice: Choice, batch: Batch, config: HiveFormerConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Squared errors of position (m) and grip, cross-entropy of the two flags."""
+    """Divergence of the heat, squared errors of position (m) and grip, cross-entropy of flags."""
+    labels = batch.labels
     error_m = (choice.action.position_in_cube - labels.position_in_cube) * (SCENE_BOUNDS.side_m / 2)
     # D-hiveformer-flags: published as the squared error of a sigmoid.
-    terms = {"bc/position": error_m.square().sum(-1).mean(), **choice.action.terms(labels)}
+    terms = {
+        "bc/heat": divergence(choice.log_heat.flatten(1), heat_labels(batch.inputs.scene, labels)),
+        "bc/position": error_m.square().sum(-1).mean(),
+        **choice.action.terms(labels),
+    }
     weights = {
+        "bc/heat": config.heat_weight,
         "bc/position": config.position_weight,
         "bc/rotation": config.recipe.rotation_weight,
     }
     return weighed(terms, weights)
+
+
+def heat_labels(scene: Pictures, labels: Labels) -> Float[Tensor, "b p"]:
+    """Probabilities of the pixels of all cameras; 0 at those that show no point."""
+    gaps = (scene.xyz_in_cube[:, -1] - labels.position_in_cube[:, None, :, None, None]).norm(dim=2)
+    gaps_m = gaps * (SCENE_BOUNDS.side_m / 2)
+    return falling_off(gaps_m.masked_fill(~scene.seen[:, -1], UNSEEN_M).flatten(1))
 
 
 AGENT = AgentSpec(

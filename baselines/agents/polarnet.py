@@ -18,12 +18,12 @@ from typing import Annotated
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from baselines.agent import AgentSpec, Network, Recipe, weighed
 from baselines.batch import Batch, Inputs, Labels, Prediction
 from baselines.configs import Fraction, Positive, Range, check_numbers
 from baselines.layers.attention import LEAK, padding_bias
+from baselines.layers.heat import divergence, falling_off
 from baselines.layers.multiview import trimmed_text
 from baselines.layers.pointnet import DecoderLayer, FeaturePropagation, Norm, SetAbstraction
 from baselines.layers.regression import POSE, UNTURNED, Regressed, tool_axes
@@ -38,9 +38,6 @@ TEMPERATURE = 0.1
 
 POINT_CHANNELS = 10
 """Position, colour, normal, height."""
-
-HEAT_REACH_M = 0.01
-"""A point this much farther from the label than another gets 1/e of its share of the heat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +223,7 @@ class PolarNet(Network):
         guess, labels = self(batch.inputs), batch.labels
         error_m = (guess.action.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
         terms = {
-            "bc/heat": _divergence(guess.heat, heat_labels(batch.inputs, labels)),
+            "bc/heat": divergence(guess.heat.log_softmax(-1), heat_labels(batch.inputs, labels)),
             "bc/position": error_m.square().mean(),
             **guess.action.terms(labels),
         }
@@ -288,7 +285,7 @@ def heat_labels(inputs: Inputs[PointCloud], labels: Labels) -> Float[Tensor, "b 
     scene = inputs.scene
     aim = labels.position_in_cube - inputs.gripper_in_cube[:, :3]
     gaps = (scene.xyz * scene.reach[:, None, None] - aim[:, None]).norm(dim=-1)
-    return (-gaps * HALF_SIDE_M / HEAT_REACH_M).softmax(-1)
+    return falling_off(gaps * HALF_SIDE_M)
 
 
 def step_code(step: Tensor, width: int) -> Float[Tensor, "b d"]:
@@ -296,11 +293,6 @@ def step_code(step: Tensor, width: int) -> Float[Tensor, "b d"]:
     rates = torch.exp(torch.arange(0, width, 2, device=step.device) * (-math.log(1e4) / width))
     angles = step[:, None] * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
-
-
-def _divergence(logits: Float[Tensor, "b n"], label: Float[Tensor, "b n"]) -> Tensor:
-    """Kullback-Leibler divergence: 0 where the heat is the label, mean over samples."""
-    return functional.kl_div(logits.log_softmax(-1), label, reduction="batchmean")
 
 
 AGENT = AgentSpec(name="polarnet", presets={"cpu": CPU, "paper": PAPER}, create=PolarNet)

@@ -47,13 +47,13 @@ def _cell_sums(x: Shaped[Tensor, "*b h w"], grid: int) -> Shaped[Tensor, "*b y x
     return strips.unflatten(-1, (grid, -1)).sum(-1)
 
 
-def heat_over(
+def log_heat_over(
     logits: Float[Tensor, "n k h w"], seen: Bool[Tensor, "n k h w"], temperature: float
 ) -> Float[Tensor, "n k h w"]:
-    """Softmax over the pixels of all cameras that show a point (D-hiveformer-masks); uniform if
-    none does."""
+    """Logarithm of a softmax over the pixels of all cameras that show a point
+    (D-hiveformer-masks); uniform if none does."""
     masked = (logits / temperature).masked_fill(~seen, -1e9)
-    return masked.flatten(1).softmax(-1).view_as(logits)
+    return masked.flatten(1).log_softmax(-1).view_as(logits)
 
 
 def mean_point(

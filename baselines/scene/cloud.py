@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, Int64, UInt8, UInt16
 
 from baselines.scene.compiled import compiled
 
@@ -62,18 +62,22 @@ def point_maps(
     intrinsics: Float32[np.ndarray, "k 3 3"],
     camera_in_base: Float32[np.ndarray, "k 4 4"],
     cube_from_base: Float32[np.ndarray, "3 4"],
+    sources: Int64[np.ndarray, "2 side"] | None = None,
 ) -> tuple[Float32[np.ndarray, "k 3 h w"], Bool[np.ndarray, "k h w"]]:
     """Cube coordinates of every pixel's point, and whether it lies in [-1, 1]^3.
 
-    `cube_from_base` includes the augmentation. Pixels that saw nothing, or something outside, are
-    at 0.
+    `cube_from_base` includes the augmentation; `sources` are the cameras' columns and rows that a
+    crop shows. Pixels that saw nothing, or something outside, are at 0.
     """
     turn, shift = cube_from_base[:, :3], cube_from_base[:, 3]
     rays = turn @ _rays(intrinsics, camera_in_base)
     origins = camera_in_base[:, :3, 3] @ turn.T + shift
     maps = np.empty((len(depth_mm), 3, *depth_mm.shape[1:]), np.float32)
     inside = np.empty(depth_mm.shape, np.bool_)
-    _map(depth_mm, rays.astype(np.float32), origins.astype(np.float32), maps, inside)
+    if sources is None:
+        sources = np.broadcast_to(np.arange(depth_mm.shape[-1]), (2, depth_mm.shape[-1]))
+    centres = sources.astype(np.float32) + np.float32(0.5)
+    _map(depth_mm, rays.astype(np.float32), origins.astype(np.float32), centres, maps, inside)
     return maps, inside
 
 
@@ -150,16 +154,17 @@ def _map(
     depth_mm: np.ndarray,
     rays: np.ndarray,
     origins: np.ndarray,
+    centres: np.ndarray,
     maps: np.ndarray,
     inside: np.ndarray,
 ) -> None:
-    half, one, nothing = np.float32(0.5), np.float32(1), np.float32(0)
+    one, nothing = np.float32(1), np.float32(0)
     for k in range(depth_mm.shape[0]):
         ray, origin = rays[k], origins[k]
         for i in range(depth_mm.shape[1]):
-            v = np.float32(i) + half
+            v = centres[1, i]
             for j in range(depth_mm.shape[2]):
-                depth, u = np.float32(depth_mm[k, i, j]), np.float32(j) + half
+                depth, u = np.float32(depth_mm[k, i, j]), centres[0, j]
                 x = (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) * depth + origin[0]
                 y = (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) * depth + origin[1]
                 z = (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) * depth + origin[2]

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
+from baselines.scene import crop
 from baselines.scene.augment import Augmentation
 from baselines.scene.cloud import Cloud, crop_to_cube, point_maps, unproject
 from baselines.scene.views import (
@@ -206,12 +207,14 @@ class Pictures:
 
 
 class CameraSight:
-    """Keeps the camera images as they are; moves only their points."""
+    """Moves the points of camera images; crops the images only if it is told to."""
 
-    def __init__(self, *, remembers: bool, steps: int = 1) -> None:
-        """Show the last `steps` observations, the present one included."""
+    def __init__(self, *, remembers: bool, steps: int = 1, crop_px: int = 0) -> None:
+        """Show the last `steps` observations, the present one included; in training in a frame
+        that is up to `crop_px` columns and rows off."""
         self.remembers = remembers
         self.steps = steps
+        self.crop_px = crop_px
 
     def look(self, moments: Sequence[Moment]) -> Pictures:
         """Images and point maps, as long a history as the longest in the batch."""
@@ -219,11 +222,13 @@ class CameraSight:
         longest = max(len(observations) for observations in shown)
         pictures = _blank(len(moments), longest)
         for row, (moment, observations) in enumerate(zip(moments, shown, strict=True)):
+            # D-hiveformer-augment. One frame an episode, as published: steps stay comparable.
+            frame = crop.draw(moment.seed, self.crop_px) if moment.seed else crop.WHOLE
             first = longest - len(observations)
             for images in (pictures.rgb, pictures.xyz_in_cube, pictures.seen):
                 images[row, :first] = 0
             for t, seen in enumerate(observations, start=first):
-                _fill(pictures, row, t, seen, moment.move)
+                _fill((pictures, row, t), seen, moment.move, frame)
         return pictures
 
 
@@ -242,14 +247,18 @@ def _blank(rows: int, steps: int) -> Pictures:
     )
 
 
-def _fill(pictures: Pictures, row: int, t: int, seen: Observation, move: Augmentation) -> None:
+def _fill(
+    place: tuple[Pictures, int, int], seen: Observation, move: Augmentation, frame: crop.Crop
+) -> None:
+    pictures, row, t = place
+    shown = frame.show(seen)
     xyz_in_cube, inside = point_maps(
-        seen.depth_mm, seen.intrinsics, seen.camera_in_base, move.to_cube()
+        shown.depth_mm, seen.intrinsics, seen.camera_in_base, move.to_cube(), shown.sources
     )
-    pictures.rgb[row, t] = torch.from_numpy(seen.rgb).permute(0, 3, 1, 2)
+    pictures.rgb[row, t] = torch.from_numpy(shown.rgb).permute(0, 3, 1, 2)
     pictures.xyz_in_cube[row, t] = torch.from_numpy(xyz_in_cube)
     pictures.seen[row, t] = torch.from_numpy(inside)
     pictures.gripper_in_cube[row, t] = torch.from_numpy(gripper_in_cube(seen, move))
-    pictures.gripper_px[row, t] = torch.from_numpy(gripper_px(seen))
+    pictures.gripper_px[row, t] = torch.from_numpy(gripper_px(seen) - frame.corner_px)
     pictures.happened[row, t] = True
     pictures.step[row, t] = seen.step

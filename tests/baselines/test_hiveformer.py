@@ -6,15 +6,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from networks import TEXT, gradients, make_inputs, tiny
+from networks import TEXT, gradients, make_batch, make_inputs, tiny
 from synthetic import observation
 from torch.nn import functional
 
-from baselines.agents.hiveformer import AGENT, CPU, PAPER, HiveFormer, HiveFormerConfig
+from baselines.agents.hiveformer import (
+    AGENT,
+    CPU,
+    PAPER,
+    HiveFormer,
+    HiveFormerConfig,
+    cloning_loss,
+    heat_labels,
+)
 from baselines.batch import Inputs
+from baselines.layers.heat import falling_off
 from baselines.layers.pictures import (
     gripper_map,
-    heat_over,
+    log_heat_over,
     mean_point,
     network_images,
     pooled_points,
@@ -142,15 +151,61 @@ def test_a_certain_pixel_gives_its_point_and_unseen_pixels_never_win() -> None:
     seen[:, 2, 3, 5], seen[:, 1, 0, 0] = True, False
     logits = torch.zeros(2, 4, 8, 8)
     logits[:, 2, 3, 5], logits[:, 1, 0, 0] = 10, 1e4
-    heat = heat_over(logits, seen, 0.1)
+    heat = log_heat_over(logits, seen, 0.1).exp()
     assert (heat[~seen] == 0).all()
     torch.testing.assert_close(mean_point(heat, xyz), xyz[:, 2, :, 3, 5])
 
 
 def test_where_nothing_is_seen_the_heatmap_is_finite() -> None:
-    heat = heat_over(torch.randn(1, 4, 8, 8), torch.zeros(1, 4, 8, 8, dtype=torch.bool), 0.1)
+    nothing = torch.zeros(1, 4, 8, 8, dtype=torch.bool)
+    heat = log_heat_over(torch.randn(1, 4, 8, 8), nothing, 0.1).exp()
     assert heat.sum() == pytest.approx(1)
     assert (mean_point(heat, torch.zeros(1, 4, 3, 8, 8)) == 0).all()
+
+
+def test_the_label_is_hottest_where_the_keyframe_is_and_cold_where_nothing_is_seen(
+    network: HiveFormer,
+) -> None:
+    batch = make_batch(network.sight)
+    scene, aim = batch.inputs.scene, batch.labels.position_in_cube
+    seen = scene.seen[:, -1].flatten(1)
+    label = heat_labels(scene, batch.labels)
+    gaps = (scene.xyz_in_cube[:, -1] - aim[:, None, :, None, None]).norm(dim=2).flatten(1)
+    hottest = gaps.masked_fill(~seen, torch.inf).argmin(-1)
+    assert torch.equal(label.argmax(-1), hottest)
+    assert (label[~seen] == 0).all()
+    torch.testing.assert_close(label.sum(-1), torch.ones(len(aim)))
+
+
+def test_a_label_falls_to_a_third_with_each_centimetre() -> None:
+    label = falling_off(torch.tensor([[0.0, 0.01, 0.03]]))[0]
+    torch.testing.assert_close(label / label[0], torch.tensor([0.0, -1.0, -3.0]).exp())
+
+
+def test_heat_on_the_label_costs_nothing_and_heat_elsewhere_does(network: HiveFormer) -> None:
+    batch = make_batch(network.sight)
+    choice = network(batch.inputs)
+    right = heat_labels(batch.inputs.scene, batch.labels).clamp_min(1e-30).log()
+    told = replace(choice, log_heat=right.view_as(choice.log_heat))
+    losses = [cloning_loss(c, batch, network.config)[1]["bc/heat"] for c in (told, choice)]
+    assert float(losses[0]) == pytest.approx(0, abs=1e-5)
+    assert losses[1] > 0.1
+
+
+def test_the_published_loss_has_no_heat_in_it(network: HiveFormer) -> None:
+    batch = make_batch(network.sight)
+    choice = network(batch.inputs)
+    other = replace(choice, log_heat=choice.log_heat.roll(7, -1))
+    totals = [cloning_loss(c, batch, PAPER)[0] for c in (choice, other)]
+    assert torch.equal(*totals)
+
+
+def test_only_training_crops(episode: list) -> None:
+    moment = Moment(episode[2], before=episode[:2])
+    sights = {reach: HiveFormer(replace(tiny(CPU), crop_px=reach), TEXT).sight for reach in (0, 9)}
+    plain = sights[0].look([replace(moment, seed=5)])
+    assert torch.equal(sights[9].look([moment]).rgb, plain.rgb)
+    assert not torch.equal(sights[9].look([replace(moment, seed=5)]).rgb, plain.rgb)
 
 
 def test_the_gripper_map_peaks_where_the_gripper_is() -> None:

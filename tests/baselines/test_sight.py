@@ -7,8 +7,10 @@ import pytest
 import torch
 from synthetic import observation
 
+from baselines.scene import crop
 from baselines.scene.augment import Augmentation
 from baselines.scene.cloud import point_maps, unproject
+from baselines.scene.crop import Crop
 from baselines.scene.sight import CameraSight, Moment, ViewSight, ZoomSight, gripper_px
 from baselines.scene.views import THREE_VIEWS, VIEWS, apply_affine, cube_from_base
 
@@ -44,6 +46,40 @@ def test_the_present_comes_last_and_shorter_histories_are_padded_before(episode)
         assert torch.equal(pictures.rgb[0, t], expected)
     for padding in (pictures.rgb, pictures.xyz_in_cube, pictures.seen):
         assert not padding[1, :2].any()
+
+
+def test_a_crop_shows_every_pixel_with_its_own_point_and_nothing_beyond_the_edges(episode):
+    seen = episode[0]
+    plain = point_maps(seen.depth_mm, seen.intrinsics, seen.camera_in_base, MOVE.to_cube())
+    shown = Crop(np.array([5, -3])).show(seen)
+    maps, inside = point_maps(
+        shown.depth_mm, seen.intrinsics, seen.camera_in_base, MOVE.to_cube(), shown.sources
+    )
+    assert np.array_equal(maps[..., 3:, :-5], plain[0][..., :-3, 5:])
+    assert np.array_equal(inside[..., 3:, :-5], plain[1][..., :-3, 5:])
+    assert np.array_equal(shown.rgb[:, 3:, :-5], seen.rgb[:, :-3, 5:])
+    assert not inside[..., :3, :].any()
+    assert not inside[..., -5:].any()
+    assert np.array_equal(shown.rgb[:, 3:, -5:], np.repeat(seen.rgb[:, :-3, -1:], 5, axis=2))
+
+
+def test_the_past_is_cropped_like_the_present_and_the_gripper_with_its_images(episode):
+    moment = Moment(episode[1], MOVE, before=episode[:1], seed=7)
+    corner = crop.draw(7, 16).corner_px
+    assert corner.any()
+    cropped = CameraSight(remembers=True, steps=2, crop_px=16).look([moment])
+    plain = CameraSight(remembers=True, steps=2).look([moment])
+    for t in range(2):
+        expected = Crop(corner).show(episode[t]).rgb
+        assert np.array_equal(cropped.rgb[0, t].permute(0, 2, 3, 1).numpy(), expected)
+    torch.testing.assert_close(cropped.gripper_px, plain.gripper_px - torch.from_numpy(corner))
+
+
+def test_crops_go_as_far_as_asked_for_and_no_farther():
+    corners = np.array([crop.draw(seed, 3).corner_px for seed in range(1, 200)])
+    assert (corners.min(0) == -3).all()
+    assert (corners.max(0) == 3).all()
+    assert not crop.draw(1, 0).corner_px.any()
 
 
 def test_only_as_many_steps_as_asked_for_are_shown(episode):
