@@ -74,6 +74,9 @@ class Act3dConfig:
     rotary_rad_per_m: float = 100.0
     """Fastest turn of the rotary code (D-act3d-rotary)."""
 
+    rotary_span: Positive = 100.0
+    """How many times faster that is than the slowest one, nearly (D-act3d-span)."""
+
     coarse_cells: int = 768
     """Coarse cells that are read: those nearest to the centre of the cube. Of 1024, this is more
     than lie in the cube, but for clutter (D-act3d-cells)."""
@@ -135,6 +138,7 @@ PAPER = Act3dConfig(
     heads=4,
     blocks=(2, 2, 2),
     rotary_rad_per_m=1.0,
+    rotary_span=10_000.0,
     coarse_cells=4096,
     fine_cells=4096,
     ghosts_learning=333,
@@ -296,7 +300,8 @@ class Act3d(Network):
 
     def _code(self, points_in_cube: Float[Tensor, "b n 3"]) -> Turns:
         config = self.config
-        return turns(METRES * points_in_cube, config.embedding, config.rotary_rad_per_m)
+        rate, span = config.rotary_rad_per_m, config.rotary_span
+        return turns(METRES * points_in_cube, config.embedding, rate, span)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Cross-entropy over the ghosts, errors of rotation, gripper and collision."""
