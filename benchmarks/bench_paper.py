@@ -132,9 +132,11 @@ def plain_unet_decoder(self: unet.UnetDecoder, grid: Tensor, skips: list[Tensor]
     return self.heat(unet.doubled(x))[:, 0]
 
 
-def plain_turns(points_m: Tensor, width: int, rad_per_m: float) -> tuple[Tensor, Tensor]:
+def plain_turns(
+    points_m: Tensor, width: int, rad_per_m: float, span: float
+) -> tuple[Tensor, Tensor]:
     """Cosines and sines."""
-    code = rotary.turns(points_m, width, rad_per_m)
+    code = rotary.turns(points_m, width, rad_per_m, span)
     return code.real.contiguous(), code.imag.contiguous()
 
 

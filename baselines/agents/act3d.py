@@ -68,11 +68,17 @@ class Act3dConfig:
     heads: int = 4
     """Attention heads; each takes a multiple of 6 channels, a pair for each axis."""
 
+    first_query: Literal["hand", "nowhere"] = "hand"
+    """Where the query is while there is no guess (D-act3d-query)."""
+
     blocks: tuple[int, int, int] = (1, 1, 2)
     """Blocks of the modules that read words, that read as ghosts, and that read as the query."""
 
     rotary_rad_per_m: float = 100.0
     """Fastest turn of the rotary code (D-act3d-rotary)."""
+
+    rotary_span: Positive = 100.0
+    """How many times faster that is than the slowest one, nearly (D-act3d-span)."""
 
     coarse_cells: int = 768
     """Coarse cells that are read: those nearest to the centre of the cube. Of 1024, this is more
@@ -133,8 +139,10 @@ PAPER = Act3dConfig(
     output_kernel=3,
     embedding=120,
     heads=4,
+    first_query="nowhere",
     blocks=(2, 2, 2),
     rotary_rad_per_m=1.0,
+    rotary_span=10_000.0,
     coarse_cells=4096,
     fine_cells=4096,
     ghosts_learning=333,
@@ -242,10 +250,10 @@ class Act3d(Network):
         guess = torch.zeros_like(inputs.gripper_in_cube[:, :3])
         levels: list[Level] = []
         for index in range(len(self.config.radii_m) + 1):
-            if index == 0:  # the query is nowhere yet
+            if index == 0:
                 cells = coarse.nearest(guess, self.config.coarse_cells)
                 context = self._context(cells, inputs, words)
-                query = self.read_as_query(query, None, replace(context, code=None))
+                query = self._first_read(query, context, inputs.gripper_in_cube[:, None, :3])
             else:
                 cells = fine.nearest(guess, self.config.fine_cells)
                 context = self._context(cells, inputs, words)
@@ -253,6 +261,14 @@ class Act3d(Network):
             levels.append(self._score(place(index, guess), query, context))
             guess = levels[-1].guess
         return Detection(levels, Regressed(guess, self.action(query[:, 0]).float()))
+
+    def _first_read(
+        self, query: Float[Tensor, "b 1 d"], context: Context, hand: Float[Tensor, "b 1 3"]
+    ) -> Float[Tensor, "b 1 d"]:
+        """The query after it has read the coarse cells, from the hand or from nowhere."""
+        if self.config.first_query == "nowhere":
+            return self.read_as_query(query, None, replace(context, code=None))
+        return self.read_as_query(query, self._code(hand), context)
 
     def _cells(self, scene: Pictures) -> tuple[Cells, Cells]:
         """The present images as coarse and fine cells of all cameras.
@@ -296,7 +312,8 @@ class Act3d(Network):
 
     def _code(self, points_in_cube: Float[Tensor, "b n 3"]) -> Turns:
         config = self.config
-        return turns(METRES * points_in_cube, config.embedding, config.rotary_rad_per_m)
+        rate, span = config.rotary_rad_per_m, config.rotary_span
+        return turns(METRES * points_in_cube, config.embedding, rate, span)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Cross-entropy over the ghosts, errors of rotation, gripper and collision."""

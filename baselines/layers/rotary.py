@@ -3,9 +3,9 @@
 Channels come in pairs. Each pair of a query or key is turned by an angle proportional to one
 coordinate of its point, so the product of a query and a key depends on where one point lies as
 seen from the other, and moving both changes nothing. Three pairs in a row stand for x, y and z;
-from three to three the angles fall from `rad_per_m` radians a metre down to nearly a
-ten-thousandth of that. So every head knows all three directions, and the first heads are the
-near-sighted ones (D-act3d-heads).
+from three to three the angles fall from `rad_per_m` radians a metre down to nearly the `span`-th
+part of that. So every head knows all three directions, and the first heads are the near-sighted
+ones (D-act3d-heads).
 """
 
 from dataclasses import dataclass
@@ -19,17 +19,14 @@ from torch.nn import functional
 
 from baselines.layers.attention import attend, linear
 
-SPAN = 10_000
-"""Ratio of the fastest to the slowest angle."""
-
 Turns: TypeAlias = Complex64[Tensor, "b n pairs"]
 """Numbers of length 1 by whose angles each pair of channels is turned at each point."""
 
 
-def turns(points_m: Float[Tensor, "b n 3"], width: int, rad_per_m: float) -> Turns:
+def turns(points_m: Float[Tensor, "b n 3"], width: int, rad_per_m: float, span: float) -> Turns:
     """Rotary code of points (m) for `width` channels, a multiple of 6."""
     triples = width // 6
-    falling = SPAN ** (-torch.arange(triples, device=points_m.device) / triples)
+    falling = span ** (-torch.arange(triples, device=points_m.device) / triples)
     angles = (points_m.float()[..., None, :] * (rad_per_m * falling)[:, None]).flatten(-2)
     return torch.complex(angles.cos(), angles.sin())
 

@@ -22,9 +22,11 @@ from baselines.agents.act3d import (
 )
 from baselines.batch import Inputs
 from baselines.layers.resnet import ResNet50
+from baselines.layers.rotary import turns
 from baselines.scene.sight import CameraSight, Pictures
 from baselines.text import TextSpec
 from sacil_tasks.errors import UsageError
+from sacil_tasks.interface import SCENE_BOUNDS
 
 CONFIG = tiny(CPU)
 SIGHT = CameraSight(remembers=False)
@@ -81,6 +83,12 @@ def test_moving_the_hand_alone_changes_scores(network: Act3d) -> None:
     zero = torch.zeros(3)
     before, after = detect(network, inputs, zero), detect(network, moved, zero)
     assert (before.levels[0].scores - after.levels[0].scores).abs().max() > 1e-4
+
+
+def test_no_pair_of_channels_turns_too_slowly_to_tell_places_apart() -> None:
+    across = SCENE_BOUNDS.side_m * torch.linspace(0, 1, 50)[None, :, None].expand(-1, -1, 3)
+    code = turns(across, CPU.embedding, CPU.rotary_rad_per_m, CPU.rotary_span)
+    assert (code - code[:, :1]).abs().amax(dim=1).min() > 0.5
 
 
 def test_words_change_scores_and_action(network: Act3d) -> None:

@@ -7,7 +7,7 @@ from torch import Tensor
 from baselines.layers.attention import padding_bias
 from baselines.layers.rotary import Context, Reader, turned, turns
 
-WIDTH, HEADS, RATE = 48, 4, 30.0
+WIDTH, HEADS, RATE, SPAN = 48, 4, 30.0, 1000.0
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +17,7 @@ def _seeded() -> None:
 
 def context(tokens: Tensor, points_m: Tensor) -> Context:
     everything = torch.ones(tokens.shape[:2], dtype=torch.bool)
-    return Context(tokens, turns(points_m, WIDTH, RATE), padding_bias(everything))
+    return Context(tokens, turns(points_m, WIDTH, RATE, SPAN), padding_bias(everything))
 
 
 def test_a_product_depends_on_the_displacement_alone() -> None:
@@ -25,22 +25,23 @@ def test_a_product_depends_on_the_displacement_alone() -> None:
     at, to, shift = torch.rand(1, 5, 3), torch.rand(1, 7, 3), torch.tensor([0.3, -0.2, 0.1])
 
     def products(move: Tensor) -> Tensor:
-        codes = turns(at + move, WIDTH, RATE), turns(to + move, WIDTH, RATE)
+        codes = turns(at + move, WIDTH, RATE, SPAN), turns(to + move, WIDTH, RATE, SPAN)
         return turned(q, codes[0]) @ turned(k, codes[1]).transpose(-1, -2)
 
     torch.testing.assert_close(products(shift), products(torch.zeros(3)), rtol=0, atol=1e-4)
     plain = q @ k.transpose(-1, -2)
     assert (products(shift) - plain).abs().max() > 1
-    torch.testing.assert_close(turned(q, codes := turns(at, WIDTH, RATE)).norm(), q.norm())
+    torch.testing.assert_close(turned(q, codes := turns(at, WIDTH, RATE, SPAN)).norm(), q.norm())
     assert codes.shape == (1, 5, WIDTH // 2)
 
 
-def test_the_fastest_angle_is_the_rate() -> None:
-    code = turns(torch.tensor([[[0.02, 0.0, 0.0]]]), WIDTH, RATE)
+def test_angles_fall_from_the_rate_to_nearly_its_part() -> None:
+    code = turns(torch.tensor([[[0.02, 0.0, 0.0]]]), WIDTH, RATE, SPAN)
     angles = code.angle()[0, 0]
     assert angles[0] == pytest.approx(0.02 * RATE)
     assert angles[1] == angles[2] == 0  # y and z
     assert (angles[0::3].diff() < 0).all()
+    assert angles[0] / angles[-3] == pytest.approx(SPAN ** (7 / 8), rel=1e-4)  # 8 triples
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -52,7 +53,7 @@ def test_every_head_sees_every_axis(axis: int) -> None:
     points = torch.rand(1, 6, 3)
     moved = points.clone()
     moved[0, 0, axis] += 10.0  # far enough for the slowest pairs to notice
-    code = turns(torch.zeros(1, 1, 3), WIDTH, RATE)
+    code = turns(torch.zeros(1, 1, 3), WIDTH, RATE, SPAN)
     with torch.no_grad():
         before = attention(x, code, *reader.memories(context(tokens, points)))
         after = attention(x, code, *reader.memories(context(tokens, moved)))
@@ -66,7 +67,7 @@ def test_a_diagonal_is_told_from_its_mirror_image() -> None:
     rising = torch.tensor([[[0.05, 0.05, 0.0], [-0.05, -0.05, 0.0], [0.0, 0.0, 0.0]]])
     falling = rising * torch.tensor([1.0, -1.0, 1.0])
     reader = Reader(WIDTH, HEADS, blocks=1)
-    query, code = torch.randn(1, 1, WIDTH), turns(torch.zeros(1, 1, 3), WIDTH, RATE)
+    query, code = torch.randn(1, 1, WIDTH), turns(torch.zeros(1, 1, 3), WIDTH, RATE, SPAN)
     with torch.no_grad():
         answers = [reader(query, code, context(tokens, points)) for points in (rising, falling)]
     assert (answers[0] - answers[1]).abs().max() > 1e-3
@@ -77,10 +78,10 @@ def test_padding_is_not_read() -> None:
     real = torch.tensor([[True] * 4 + [False] * 2])
     loud = torch.where(real[..., None], tokens, torch.tensor(50.0))
     reader, query = Reader(WIDTH, HEADS, blocks=2), torch.randn(1, 3, WIDTH)
-    code = turns(torch.rand(1, 3, 3), WIDTH, RATE)
+    code = turns(torch.rand(1, 3, 3), WIDTH, RATE, SPAN)
     with torch.no_grad():
         answers = [
-            reader(query, code, Context(t, turns(points, WIDTH, RATE), padding_bias(real)))
+            reader(query, code, Context(t, turns(points, WIDTH, RATE, SPAN), padding_bias(real)))
             for t in (tokens, loud)
         ]
     assert torch.equal(*answers)
@@ -96,7 +97,7 @@ def slow_turned(x: Tensor, code: Tensor) -> Tensor:
 def test_a_reader_is_its_blocks_one_after_the_other() -> None:
     reader, x = Reader(WIDTH, HEADS, blocks=2), torch.randn(2, 3, WIDTH)
     read = context(torch.randn(2, 6, WIDTH), torch.rand(2, 6, 3))
-    code = turns(torch.rand(2, 3, 3), WIDTH, RATE)
+    code = turns(torch.rand(2, 3, 3), WIDTH, RATE, SPAN)
     expected = x
     for block in reader.blocks:
         layers = block.attention
