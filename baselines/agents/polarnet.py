@@ -86,6 +86,10 @@ class PolarNetConfig:
     heat_weight: float = 1.0
     """Weight of the heatmap's divergence from its label (D-polarnet-heat)."""
 
+    vote_weight: float = 100.0
+    """Weight of the squared error in square metres of what each point says by itself, where the
+    heat should be (D-polarnet-votes)."""
+
     position_weight: float = 100.0
     """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
     the grip's (D-polarnet-weights)."""
@@ -140,6 +144,7 @@ PAPER = PolarNetConfig(
     layers=2,
     dropout=0.1,
     heat_weight=0.0,
+    vote_weight=0.0,
     position_weight=1.0,
     recipe=Recipe(  # D-polarnet-recipe
         samples=200_000 * 8 * 5,
@@ -160,6 +165,9 @@ class Guess:
 
     heat: Float[Tensor, "b n"]
     """Logits over the points."""
+
+    votes: Float[Tensor, "b n 3"]
+    """Where each point, with its offset, says the gripper should go, in the cube."""
 
     action: Regressed
 
@@ -214,21 +222,25 @@ class PolarNet(Network):
 
     def _guess(self, points: Tensor, pose: Tensor, inputs: Inputs[PointCloud]) -> Guess:
         heat = points[..., 0] / TEMPERATURE
-        voted = read_out(heat, inputs.scene.xyz + points[..., 1:])
-        position = inputs.gripper_in_cube[:, :3] + inputs.scene.reach[:, None] * voted
-        return Guess(heat, Regressed(position, pose))
+        hand, reach = inputs.gripper_in_cube[:, None, :3], inputs.scene.reach[:, None, None]
+        votes = hand + reach * (inputs.scene.xyz + points[..., 1:])
+        return Guess(heat, votes, Regressed(read_out(heat, votes), pose))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Behaviour cloning; terms without their weights."""
         guess, labels = self(batch.inputs), batch.labels
         error_m = (guess.action.position_in_cube - labels.position_in_cube) * HALF_SIDE_M
+        gaps_m = (guess.votes - labels.position_in_cube[:, None]) * HALF_SIDE_M
+        label = heat_labels(batch.inputs, labels)
         terms = {
-            "bc/heat": divergence(guess.heat.log_softmax(-1), heat_labels(batch.inputs, labels)),
+            "bc/heat": divergence(guess.heat.log_softmax(-1), label),
+            "bc/votes": (label * gaps_m.square().mean(-1)).sum(-1).mean(),
             "bc/position": error_m.square().mean(),
             **guess.action.terms(labels),
         }
         weights = {
             "bc/heat": self.config.heat_weight,
+            "bc/votes": self.config.vote_weight,
             "bc/position": self.config.position_weight,
             "bc/rotation": self.config.recipe.rotation_weight,
         }

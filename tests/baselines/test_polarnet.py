@@ -110,6 +110,24 @@ def test_the_label_is_hottest_where_the_keyframe_is(network: PolarNet) -> None:
     torch.testing.assert_close(target.sum(-1), torch.ones(len(aim)))
 
 
+def test_votes_are_taught_where_the_heat_should_be(network: PolarNet) -> None:
+    batch = make_batch(network.sight)
+    guess, aim = network(batch.inputs), batch.labels.position_in_cube
+    label = heat_labels(batch.inputs, batch.labels)
+
+    def error(votes: torch.Tensor) -> float:
+        network.forward = lambda inputs: replace(guess, votes=votes)
+        return float(network.loss(batch)[1]["bc/votes"])
+
+    exact = aim[:, None].expand_as(guess.votes)
+    assert error(exact) == 0
+    assert error(exact + 0.02 / HALF_SIDE_M) == pytest.approx(0.02**2, rel=1e-4)
+    aside = torch.zeros_like(exact)
+    aside[torch.arange(len(label)), label.argmax(-1)] = 0.02 / HALF_SIDE_M
+    share = float(label.amax(-1).mean())
+    assert error(exact + aside) == pytest.approx(share * 0.02**2, rel=1e-4)
+
+
 def test_all_names_of_a_grasp_cost_the_same(network: PolarNet) -> None:
     batch = make_batch(network.sight)
     turn = batch.labels.quaternion_wxyz
