@@ -34,16 +34,16 @@ from sacil_agent.contrast import Contrast, diagnostics, same_meaning
 class SacilRvt2Config(Rvt2Config):
     """Sizes of RVT-2 and weights of the contrasts; the defaults are the `cpu` preset."""
 
-    image_text_weight: float = 1.0
-    """Weight of Image-Text Contrast (Eq. 3)."""
+    image_text_weight: float = 0.1
+    """Weight of Image-Text Contrast (Eq. 3; D-zoom-weights)."""
 
-    current_goal_weight: float = 1.0
-    """Weight of Current-Goal Contrast (Eq. 4)."""
+    current_goal_weight: float = 0.1
+    """Weight of Current-Goal Contrast (Eq. 4; D-zoom-weights)."""
 
 
 CPU = SacilRvt2Config()
 
-PAPER = SacilRvt2Config(**vars(RVT2_PAPER))
+PAPER = SacilRvt2Config(**vars(RVT2_PAPER), image_text_weight=1.0, current_goal_weight=1.0)
 
 
 class SacilRvt2(Rvt2):

@@ -41,14 +41,16 @@ def test_it_acts_like_rvt2_with_the_same_weights(network: SacilRvt2) -> None:
 def test_the_contrasts_are_added_to_the_loss_of_rvt2(network: SacilRvt2) -> None:
     batch = make_batch(SIGHT, goals=GOALS)
     cloning, _ = Rvt2.loss(network, batch)
+    network.config = replace(CONFIG, image_text_weight=0.5, current_goal_weight=0.25)
     total, terms = network.loss(batch)
-    torch.testing.assert_close(total, cloning + terms["itc/loss"] + terms["cgc/loss"])
+    torch.testing.assert_close(total, cloning + terms["itc/loss"] / 2 + terms["cgc/loss"] / 4)
     assert {name.partition("/")[0] for name in terms} == {"bc", "itc", "cgc"}
 
 
 @pytest.mark.parametrize("contrast", ["image_text", "current_goal"])
 def test_contrasts_teach_the_coarse_stage_alone(network: SacilRvt2, contrast: str) -> None:
     batch = make_batch(SIGHT, goals=GOALS)
+    network.config = replace(CONFIG, image_text_weight=1.0, current_goal_weight=1.0)
     with torch.no_grad():
         base = network.loss(batch)[0]
     weights = {"image_text_weight": 0.0, "current_goal_weight": 0.0}
