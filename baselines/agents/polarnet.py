@@ -94,7 +94,9 @@ class PolarNetConfig:
     """Weight of the squared position error in square metres; `recipe.rotation_weight` is that of
     the grip's (D-polarnet-weights)."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(precision="bf16", augment=UNTURNED))
+    recipe: Recipe = field(
+        default_factory=lambda: Recipe(lr=3e-3, precision="bf16", augment=UNTURNED)
+    )
     """How to train."""
 
     def __post_init__(self) -> None:
