@@ -139,7 +139,7 @@ class Trainer:
         return {name: float(term) for name, term in ({"loss": loss.detach()} | terms).items()}
 
     def _arithmetic(self) -> AbstractContextManager[object]:
-        """D-precision: bfloat16 in the `cpu` preset."""
+        """D-precision: bfloat16 in the `cpu` preset; 32 bits at a CPU's full width."""
         if self.recipe.precision == "bf16":
             return torch.autocast(self.device.type, torch.bfloat16)
         return FullWidth() if self.device.type == "cpu" else nullcontext()

@@ -73,8 +73,10 @@ class PerRow(nn.Module):
         if self.training:
             count = x.shape[:-1].numel()
             kept["num_batches_tracked"].add_(1)
-            kept["running_mean"].lerp_((sign * mean.detach()).float(), MOMENTUM)
-            kept["running_var"].lerp_((count / (count - 1) * variance.detach()).float(), MOMENTUM)
+            news = {"mean": sign * mean, "var": count / (count - 1) * variance}
+            for name, new in news.items():
+                old = kept[f"running_{name}"]
+                old.lerp_(new.detach().to(old.dtype), MOMENTUM)
         else:
             mean, variance = sign * kept["running_mean"], kept["running_var"]
         scale = sign * self.norm.weight * (variance + self.norm.eps).rsqrt()

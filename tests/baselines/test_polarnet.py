@@ -46,6 +46,17 @@ def test_the_paper_preset_has_the_published_number_of_parameters() -> None:
     assert sum(p.numel() for p in network.parameters()) == 14_150_537 + added_outputs
 
 
+def test_batch_norm_keeps_its_statistics_in_double_precision() -> None:
+    config = replace(PAPER, points=64, stages=(32, 16, 8, 4), neighbours=4)
+    block = PolarNet(config, TEXT).double().encoder[0]
+    near = torch.zeros(2, 32, 4, dtype=torch.int32)
+    features, xyz = (torch.randn(2, 64, width).double() for width in (64, 3))
+    block(features, xyz, near)
+    kept = [b for n, b in block.named_buffers() if n.endswith("running_mean")]
+    assert kept
+    assert all(b.dtype == torch.float64 and b.any() for b in kept)
+
+
 @pytest.mark.parametrize("rough", [False, True])
 def test_the_paper_preset_learns_with_batch_norm(rough: bool) -> None:  # noqa: FBT001
     config = replace(PAPER, points=64, stages=(32, 16, 8, 4), neighbours=4)

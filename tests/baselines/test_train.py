@@ -179,12 +179,17 @@ def test_what_does_not_change_is_there_again_after_a_resumption(
     assert np.array_equal(found.text[sentence], expected.text[sentence])
 
 
-def test_a_run_is_not_resumed_with_another_text_encoder(data, tmp_path, monkeypatch):
-    flags = (data, tmp_path / "run", "--steps", "12")
+def interrupt(monkeypatch, flags):
+    """Begin a run that is stopped at its sixth step."""
     with monkeypatch.context() as patch:
         stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             train(*flags)
+
+
+def test_a_run_is_not_resumed_with_another_text_encoder(data, tmp_path, monkeypatch):
+    flags = (data, tmp_path / "run", "--steps", "12")
+    interrupt(monkeypatch, flags)
     state = TrainState.load(tmp_path / "run")
     text = replace(state.plan.text, fingerprint="0" * 64)
     replace(state, plan=replace(state.plan, text=text)).save(tmp_path / "run")
@@ -207,10 +212,7 @@ def test_a_run_is_not_resumed_with_the_state_of_another_network(
     data, tmp_path, monkeypatch, change
 ):
     flags = (data, tmp_path / "run", "--steps", "12")
-    with monkeypatch.context() as patch:
-        stop_at(patch, 6, lambda: signal.raise_signal(signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):
-            train(*flags)
+    interrupt(monkeypatch, flags)
     state = TrainState.load(tmp_path / "run")
     replace(state, tensors=change(state.tensors)).save(tmp_path / "run")
     with pytest.raises(UsageError, match="the state of another network"):
